@@ -1,0 +1,47 @@
+"""Wide-field distortion calibration: WPDC-2P as astropy models in a gwcs pipeline."""
+
+from importlib import import_module
+
+# Public name -> module that defines it.  Resolved on first use (PEP 562), so that `import wpdc_gwcs`, which asdf does
+# for every file it opens, stays light.
+_PUBLIC = {
+    "PVPolynomial": "models",
+    "LookupTable": "models",
+    "read_catalog": "catalogs",
+    "detect_sources": "detection",
+    "fit_centroids": "centroids",
+    "build_epsf": "centroids",
+    "match_sources": "matching",
+    "WPDCFitter": "fitting",
+    "RadialWeight": "fitting",
+    "ResidualMap": "lookup",
+    "build_lookup_table": "lookup",
+    "build_wcs": "wcs",
+    "to_stock_wcs": "wcs",
+    "DistortionSolution": "solution",
+    "Calibration": "solution",
+    "calibrate": "calibration",
+    "evaluate": "evaluation",
+    "detect_drift": "evaluation",
+    "read": "io",
+    "write": "io",
+    "simulate": "simulation",
+}
+
+__all__ = sorted([*_PUBLIC, "__version__"])
+
+
+def __getattr__(name):
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("wpdc_gwcs")
+    if name in _PUBLIC:
+        value = getattr(import_module(f"wpdc_gwcs.{_PUBLIC[name]}"), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__():
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,66 @@
+"""Errors and warnings of wpdc_gwcs.
+
+Every error that a caller may want to catch derives from `WPDCError`.  Two families matter to pipelines: input that
+cannot be used at all (`InputError`; the command line answers with exit status 2), and a frame that was read but could
+not be solved (`FrameFailure`; exit status 1, the other frames go on).
+"""
+
+from astropy.utils.exceptions import AstropyUserWarning
+
+__all__ = [
+    "CatalogError",
+    "CentroidWarning",
+    "DetectionError",
+    "FileFormatError",
+    "FitError",
+    "FrameError",
+    "FrameFailure",
+    "InputError",
+    "MatchError",
+    "WPDCError",
+    "WPDCWarning",
+]
+
+
+class WPDCError(Exception):
+    """Base class of every error raised on purpose by wpdc_gwcs."""
+
+
+class InputError(WPDCError):
+    """Input that cannot be used: the message names the file, the rule and the value."""
+
+
+class FrameError(InputError):
+    """A frame (image, source list or its header) that cannot be read or has no usable WCS."""
+
+
+class CatalogError(InputError):
+    """A reference catalogue that cannot be read or lacks what is needed."""
+
+
+class FileFormatError(InputError):
+    """A solution, calibration or header file that is damaged, inconsistent or of a newer format."""
+
+
+class FrameFailure(WPDCError):
+    """A readable frame that could not be solved."""
+
+
+class DetectionError(FrameFailure):
+    """No usable stars were found on the image."""
+
+
+class MatchError(FrameFailure):
+    """The sources could not be matched to the reference catalogue with sufficient evidence."""
+
+
+class FitError(FrameFailure):
+    """The distortion or the attitude could not be determined from the matches."""
+
+
+class WPDCWarning(AstropyUserWarning):
+    """Base class of the warnings of wpdc_gwcs."""
+
+
+class CentroidWarning(WPDCWarning):
+    """Centroids are of lower quality than asked for (for example windowed instead of PSF-fitted)."""

@@ -1,0 +1,53 @@
+"""A frame: what one exposure of one detector brings to a calibration."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+__all__ = ["Frame"]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One exposure of one detector: an image or a source list, with the WCS and epoch of its header.
+
+    Parameters
+    ----------
+    name : str
+        Stem of the files written for this frame.
+    detector : str
+        Name of the detector; frames of one detector share one distortion solution.
+    image_shape : (int, int)
+        Shape of the detector, ``(ny, nx)`` in pixels.
+    wcs : object
+        Starting WCS with the shared low-level interface (``pixel_to_world_values``, zero based), for example
+        `astropy.wcs.WCS`.
+    epoch : float, optional
+        Mid-exposure epoch in Julian years; `None` where the header has no date.
+    source : str
+        Where it came from, for messages: path and extension.
+    load_image : callable, optional
+        Returns the image as a float array ``[y, x]``; called once, when needed.
+    load_sources : callable, optional
+        Returns the source table (``x``, ``y`` zero based, optional ``x_err``, ``y_err``, ``flux``, ``snr``,
+        ``roundness``, ``flags``).  Exactly one of the two loaders is given.
+    gain, saturation : float, optional
+        Electrons per count and saturation level in counts, from the header.
+    meta : dict
+        Other facts of the header worth keeping (filter, exposure time, ...).
+    """
+
+    name: str
+    detector: str
+    image_shape: tuple[int, int]
+    wcs: object
+    epoch: float | None = None
+    source: str = ""
+    load_image: Callable | None = None
+    load_sources: Callable | None = None
+    gain: float | None = None
+    saturation: float | None = None
+    meta: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        if (self.load_image is None) == (self.load_sources is None):
+            raise ValueError("a Frame needs exactly one of load_image and load_sources")
