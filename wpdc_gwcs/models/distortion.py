@@ -1,0 +1,352 @@
+"""Step 1 of the WCS, detector to undistorted pixels, and its fusion with the tangent plane.
+
+::
+
+    detector px --CRPIX shift, CD, PV, CD^-1, shift back--+
+          |                                              (-)--> undistorted px --TangentSky--> sky
+          +---------------LookupTable---------------------+
+    \\_______________ DistortionCorrection _______________/
+    \\_________________________________ DetectorToSky _________________________________/
+"""
+
+import numpy as np
+from astropy.modeling import Model, Parameter
+
+from wpdc_gwcs.models.blocks import evaluate_blocks
+from wpdc_gwcs.models.lookup_table import LookupTable
+from wpdc_gwcs.models.mapping import PlaneMap, expand_pv
+from wpdc_gwcs.models.polynomial import PVPolynomial
+from wpdc_gwcs.models.tangent import TangentSky, check_invertible
+
+__all__ = ["DetectorToSky", "DistortionCorrection", "DistortionInverse", "SkyToDetector"]
+
+# Residual of the inverse in undistorted pixels; Newton's last step leaves far less.
+_TOLERANCE_PX = 1e-10
+
+
+class DistortionCorrection(Model):
+    """Detector pixels to undistorted pixels: the PV polynomial in pixels, minus the look-up table.
+
+    Parameters
+    ----------
+    crpix : (float, float)
+        Reference point in zero-based pixels, (x, y).
+    cd : (2, 2) array_like
+        The matrix in which the PV polynomial stands, degrees per pixel.
+    pv : PVPolynomial, optional
+        The polynomial; the identity by default.
+    lookup_table : LookupTable, optional
+        What is subtracted after it; nothing by default.
+    **kwargs
+        ``name`` and ``meta`` of the model.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, a number is not finite or ``cd`` is singular.
+    TypeError
+        If ``pv`` or ``lookup_table`` is of another type.
+
+    Notes
+    -----
+    ::
+
+        X' = CD^-1 PV(CD (x - CRPIX)) + CRPIX - table(x)
+
+    This is ``pv_chain - lookup_table`` of ordinary model arithmetic (`composed` returns it), evaluated in
+    one pass: in each cell of the table the whole of it is one bicubic polynomial.  `DetectorToSky` takes
+    the tangent plane into the same pass.
+
+    Outside the table's nodes it is NaN; without a table it is defined everywhere.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import DistortionCorrection, PVPolynomial
+    >>> model = DistortionCorrection((49.5, 49.5), [[-1e-4, 0], [0, 1e-4]], PVPolynomial(pv1_0=2e-4))
+    >>> x, y = model(10.0, 20.0)
+    >>> float(x), float(y)
+    (8.0, 20.0)
+    >>> x, y = model.inverse(8.0, 20.0)
+    >>> float(x), float(y)
+    (10.0, 20.0)
+    """
+
+    n_inputs = 2
+    n_outputs = 2
+    _separable = False
+    standard_broadcasting = False
+
+    crpix = Parameter(default=[0.0, 0.0], description="reference point, zero-based pixels")
+    cd = Parameter(
+        default=[[1.0, 0.0], [0.0, 1.0]],
+        description="matrix the polynomial stands in, degrees per pixel",
+    )
+
+    def __init__(self, crpix, cd, pv=None, lookup_table=None, **kwargs):
+        pv = PVPolynomial(1) if pv is None else pv
+        if not isinstance(pv, PVPolynomial):
+            raise TypeError(f"pv must be a PVPolynomial, not {type(pv).__name__}")
+        if lookup_table is not None and not isinstance(lookup_table, LookupTable):
+            raise TypeError(
+                f"lookup_table must be a LookupTable, not {type(lookup_table).__name__}"
+            )
+        crpix, cd = np.array(crpix, dtype=float), np.array(cd, dtype=float)
+        for label, value, shape in (("crpix", crpix, (2,)), ("cd", cd, (2, 2))):
+            if value.shape != shape:
+                raise ValueError(f"{label} must have the shape {shape}, not {value.shape}")
+        for label, value in (("crpix", crpix), ("cd", cd), ("pv", pv.coefficients)):
+            if not np.all(np.isfinite(value)):
+                raise ValueError(f"{label} must be finite, not {value.tolist()}")
+        check_invertible("cd", cd)
+        self._pv = pv
+        self._lookup_table = lookup_table
+        self._cache = None
+        super().__init__(crpix=crpix, cd=cd, **kwargs)
+        self.inputs = ("x", "y")
+        self.outputs = ("x_undistorted", "y_undistorted")
+
+    def __getstate__(self):
+        # The folded coefficients are worked out again where they are needed.
+        return {**self.__dict__, "_cache": None}
+
+    @property
+    def pv(self):
+        """The PV polynomial."""
+        return self._pv
+
+    @property
+    def lookup_table(self):
+        """The look-up table, or `None`."""
+        return self._lookup_table
+
+    @property
+    def composed(self):
+        """The same as a compound model of simple parts, ``pv_chain - lookup_table``: slow but plain."""
+        from astropy.modeling.models import AffineTransformation2D, Identity
+
+        matrix, crpix = self.cd.value, self.crpix.value
+        to_plane = AffineTransformation2D(matrix, translation=-matrix @ crpix)
+        chain = (
+            to_plane | self.pv | AffineTransformation2D(np.linalg.inv(matrix), translation=crpix)
+        )
+        if self._lookup_table is None:
+            return chain | Identity(2)
+        return chain - self._lookup_table
+
+    def _plane_map(self, crpix=None, cd=None):
+        """The map on blocks, kept until a parameter, the polynomial or the table changes."""
+        if crpix is None:
+            crpix, cd = self.crpix.value, self.cd.value
+        pv = self._pv
+        numbers = np.concatenate([np.ravel(crpix), np.ravel(cd), pv.parameters])
+        cells = None if self._lookup_table is None else self._lookup_table._cells()
+        cache = self._cache
+        if cache is not None and cache[1] is cells and np.array_equal(cache[0], numbers):
+            return cache[2]
+        crpix, cd = numbers[:2], numbers[2:6].reshape(2, 2)
+        polynomial, radial = expand_pv(numbers[6:].reshape(2, -1), pv.degree, pv.radial, cd)
+        to_pixels = np.linalg.inv(cd)
+        polynomial = np.einsum("ij,jpq->ipq", to_pixels, polynomial)
+        polynomial[:, 0, 0] += crpix
+        if radial is not None:
+            radial = to_pixels @ radial
+        plane_map = PlaneMap(
+            polynomial,
+            crpix,
+            radial=radial,
+            radial_matrix=cd,
+            grid=None if cells is None else cells.negated(),
+        )
+        self._cache = (numbers, cells, plane_map)
+        return plane_map
+
+    def evaluate(self, x, y, crpix, cd):
+        """Correct the distortion.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Detector pixel coordinates, zero based.
+        crpix, cd : array_like
+            The parameters.
+
+        Returns
+        -------
+        x, y : ndarray
+            Undistorted pixel coordinates, zero based; NaN outside the table.
+        """
+        return evaluate_blocks(self._plane_map(crpix, cd), x, y)
+
+    def jacobian(self, x, y):
+        """Derivatives of both outputs by both inputs.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Detector pixel coordinates, zero based.
+
+        Returns
+        -------
+        jacobian : (2, 2, ...) ndarray
+            ``jacobian[i, j]`` is the derivative of output i by input j.
+        """
+        plane_map = self._plane_map()
+        rows = evaluate_blocks(lambda a, b: plane_map.jacobian(a, b)[1], x, y, n_outputs=4)
+        return np.array(rows).reshape(2, 2, *rows[0].shape)
+
+    @property
+    def inverse(self):
+        """The exact inverse, by Newton's method (a `DistortionInverse`)."""
+        return DistortionInverse(self)
+
+
+class DistortionInverse(Model):
+    """Undistorted pixels to detector pixels: the inverse of `DistortionCorrection` by Newton's method.
+
+    Every answer has been verified by its residual (1e-10 px).  NaN where there is none, which includes
+    all points whose answer would lie outside the table's nodes.
+
+    Parameters
+    ----------
+    distortion : DistortionCorrection
+        The model to invert.
+    **kwargs
+        ``name`` and ``meta`` of the model.
+    """
+
+    n_inputs = 2
+    n_outputs = 2
+    _separable = False
+
+    # astropy takes a model without Parameters for one that wants Quantities.
+    uses_quantity = False
+
+    def __init__(self, distortion, **kwargs):
+        self.distortion = distortion
+        super().__init__(**kwargs)
+        self.inputs = ("x_undistorted", "y_undistorted")
+        self.outputs = ("x", "y")
+
+    def _block_function(self):
+        plane_map = self.distortion._plane_map()
+
+        def invert(x, y):
+            return plane_map.invert(x, y, x, y, tolerance=_TOLERANCE_PX)
+
+        return invert
+
+    def evaluate(self, x, y):
+        """Put the distortion back.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Undistorted pixel coordinates, zero based.
+
+        Returns
+        -------
+        x, y : ndarray
+            Detector pixel coordinates, zero based; NaN where there is no answer.
+        """
+        return evaluate_blocks(self._block_function(), x, y)
+
+    @property
+    def inverse(self):
+        """The model from detector to undistorted pixels."""
+        return self.distortion
+
+
+class DetectorToSky(Model):
+    """Detector pixels to the sky in one pass: ``distortion | sky``.
+
+    Parameters
+    ----------
+    distortion : DistortionCorrection
+        Detector to undistorted pixels.
+    sky : TangentSky
+        Undistorted pixels to the sky.
+    **kwargs
+        ``name`` and ``meta`` of the model.
+    """
+
+    n_inputs = 2
+    n_outputs = 2
+    _separable = False
+    uses_quantity = False
+
+    def __init__(self, distortion, sky, **kwargs):
+        self.distortion = distortion
+        self.sky = sky
+        super().__init__(**kwargs)
+        self.inputs, self.outputs = distortion.inputs, sky.outputs
+
+    def evaluate(self, x, y):
+        """Map detector pixels to the sky.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Detector pixel coordinates, zero based.
+
+        Returns
+        -------
+        ra, dec : ndarray
+            Positions in degrees; NaN outside the table.
+        """
+        undistort = self.distortion._plane_map()
+        sky = self.sky
+        to_sky = sky._block_function(sky.crpix.value, sky.cd.value, sky.crval.value)
+        return evaluate_blocks(lambda a, b: to_sky(*undistort(a, b)), x, y)
+
+    @property
+    def inverse(self):
+        """The exact inverse (a `SkyToDetector`)."""
+        return SkyToDetector(self.distortion, self.sky)
+
+
+class SkyToDetector(Model):
+    """The sky to detector pixels in one pass: the inverse of `DetectorToSky`.
+
+    Parameters
+    ----------
+    distortion : DistortionCorrection
+        Detector to undistorted pixels.
+    sky : TangentSky
+        Undistorted pixels to the sky.
+    **kwargs
+        ``name`` and ``meta`` of the model.
+    """
+
+    n_inputs = 2
+    n_outputs = 2
+    _separable = False
+    uses_quantity = False
+
+    def __init__(self, distortion, sky, **kwargs):
+        self.distortion = distortion
+        self.sky = sky
+        super().__init__(**kwargs)
+        self.inputs, self.outputs = sky.outputs, distortion.inputs
+
+    def evaluate(self, ra, dec):
+        """Map the sky to detector pixels.
+
+        Parameters
+        ----------
+        ra, dec : array_like
+            Positions in degrees.
+
+        Returns
+        -------
+        x, y : ndarray
+            Detector pixel coordinates, zero based; NaN where there is no answer.
+        """
+        sky = self.sky.inverse
+        to_pixels = sky._block_function(sky.crpix.value, sky.cd.value, sky.crval.value)
+        invert = DistortionInverse(self.distortion)._block_function()
+        return evaluate_blocks(lambda a, b: invert(*to_pixels(a, b)), ra, dec)
+
+    @property
+    def inverse(self):
+        """The model from detector pixels to the sky."""
+        return DetectorToSky(self.distortion, self.sky)

@@ -1,0 +1,450 @@
+"""The numerical core: a smooth map of the plane, its Jacobian and its inverse, on plain 1-D arrays.
+
+::
+
+    (x, y) --polynomial (any degree, radial terms)--+--> (a, b)
+           --piecewise bicubic on a grid of cells---+
+
+A cubic polynomial is bicubic on each cell of a grid, so where there is a table the polynomial is folded
+into the table's cells and costs nothing.  Everything here takes and returns contiguous float64 blocks;
+models hand over blocks through `wpdc_gwcs.models.blocks`.
+"""
+
+from math import comb
+
+import numpy as np
+
+from wpdc_gwcs.models.terms import pv_terms
+
+__all__ = ["CellGrid", "PlaneMap", "expand_pv"]
+
+_MAX_NEWTON = 25
+
+# How far outside the grid (px) an iterate may go.
+_RIM = 1e-6
+
+
+def _linear_power(coefficients, power):
+    """Coefficients of ``(c0 a + c1 b)**power`` by the power of ``a``, lowest first."""
+    c0, c1 = coefficients
+    return np.array([comb(power, i) * c0**i * c1 ** (power - i) for i in range(power + 1)])
+
+
+def expand_pv(coefficients, degree, radial, matrix):
+    """Expand a PV polynomial of ``matrix @ (u, v)`` into powers of u and v.
+
+    Parameters
+    ----------
+    coefficients : (2, n_terms) ndarray
+        In the order of `~wpdc_gwcs.models.pv_terms`.
+    degree : int
+        Degree of the polynomial.
+    radial : bool
+        Whether radial terms are among the coefficients.
+    matrix : (2, 2) ndarray
+        Linear map from (u, v) to (xi, eta).
+
+    Returns
+    -------
+    polynomial : (2, degree + 1, degree + 1) ndarray
+        ``polynomial[k, p, q]`` multiplies ``u**p v**q`` in output k.
+    radial_polynomial : (2, degree + 1) ndarray or None
+        ``radial_polynomial[k, s]`` multiplies ``r**s`` in output k; `None` without radial terms.
+    """
+    terms = pv_terms(degree, radial)
+    n = degree + 1
+    polynomial = np.zeros((2, n, n))
+    in_radius = np.zeros((2, n))
+    powers = [[_linear_power(row, p) for p in range(n)] for row in matrix]
+    for axis in (0, 1):
+        own_powers, other_powers = powers[axis], powers[1 - axis]
+        for value, own, other, radius in zip(
+            coefficients[axis], terms.own, terms.other, terms.radius, strict=True
+        ):
+            if value == 0.0:
+                continue
+            if radius:
+                in_radius[axis, radius] += value
+                continue
+            total = own + other
+            homogeneous = np.convolve(own_powers[own], other_powers[other])
+            polynomial[axis, np.arange(total + 1), total - np.arange(total + 1)] += (
+                value * homogeneous
+            )
+    return polynomial, (in_radius if in_radius.any() else None)
+
+
+def _horner(coefficients, a, b):
+    """Sum of ``coefficients[p, q] a**p b**q`` over ``p + q < n`` by Horner's rule."""
+    n = len(coefficients)
+    total = None
+    for p in range(n - 1, -1, -1):
+        row = coefficients[p]
+        q = n - 1 - p
+        if q == 0:
+            total = np.full(a.shape, row[0])
+            continue
+        inner = row[q] * b
+        inner += row[q - 1]
+        for k in range(q - 2, -1, -1):
+            inner *= b
+            inner += row[k]
+        total *= a
+        total += inner
+    return total
+
+
+def _derivative(coefficients, axis):
+    """Coefficients of the derivative by u (axis 0) or v (axis 1)."""
+    n = len(coefficients)
+    if n == 1:
+        return np.zeros((1, 1))
+    factors = np.arange(1.0, n)
+    if axis == 0:
+        return coefficients[1:, : n - 1] * factors[:, np.newaxis]
+    return coefficients[: n - 1, 1:] * factors
+
+
+class CellGrid:
+    """Equally spaced cells, each with its own polynomial in local coordinates from 0 to 1.
+
+    Parameters
+    ----------
+    x_range, y_range : (float, float)
+        First and last edge.
+    coefficients : (2, n, n, ny, nx) ndarray
+        ``coefficients[k, p, q, j, i]`` multiplies ``s**p t**q`` in output k in cell (j, i).
+    """
+
+    def __init__(self, x_range, y_range, coefficients):
+        self.x_low, self.x_high = (float(edge) for edge in x_range)
+        self.y_low, self.y_high = (float(edge) for edge in y_range)
+        self.ny, self.nx = coefficients.shape[-2:]
+        self.x_step = (self.x_high - self.x_low) / self.nx
+        self.y_step = (self.y_high - self.y_low) / self.ny
+        n = coefficients.shape[1]
+        # One contiguous row of cells for each coefficient: a row fits the first-level cache.
+        self.rows = np.ascontiguousarray(coefficients.reshape(2, n, n, -1))
+
+    def locate(self, x, y, margin=0.0):
+        """Return cell numbers, local coordinates and what is outside by more than the margin.
+
+        ``outside`` is `None` when every point is inside.
+        """
+        x_low, x_high = self.x_low - margin, self.x_high + margin
+        y_low, y_high = self.y_low - margin, self.y_high + margin
+        outside = None
+        # Written so that NaN counts as outside.
+        if len(x) and not (
+            x.min() >= x_low and x.max() <= x_high and y.min() >= y_low and y.max() <= y_high
+        ):
+            good = (x >= x_low) & (x <= x_high)
+            good &= (y >= y_low) & (y <= y_high)
+            outside = ~good
+            x = np.where(good, x, self.x_low)
+            y = np.where(good, y, self.y_low)
+        s = x - self.x_low
+        s *= 1.0 / self.x_step
+        t = y - self.y_low
+        t *= 1.0 / self.y_step
+        i = s.astype(np.intp)
+        j = t.astype(np.intp)
+        # The last edge belongs to the last cell.
+        np.minimum(i, self.nx - 1, out=i)
+        np.minimum(j, self.ny - 1, out=j)
+        s -= i
+        t -= j
+        j *= self.nx
+        j += i
+        return j, s, t, outside
+
+    def evaluate(self, cell, s, t):
+        """Return both outputs."""
+        outputs = []
+        part = np.empty_like(s)
+        inner = np.empty_like(s)
+        n = self.rows.shape[1]
+        for rows in self.rows:
+            total = np.empty_like(s)
+            for p in range(n - 1, -1, -1):
+                target = total if p == n - 1 else inner
+                rows[p, n - 1].take(cell, out=target, mode="clip")
+                for q in range(n - 2, -1, -1):
+                    target *= t
+                    rows[p, q].take(cell, out=part, mode="clip")
+                    target += part
+                if target is inner:
+                    total *= s
+                    total += inner
+            outputs.append(total)
+        return outputs
+
+    def evaluate_jacobian(self, cell, s, t):
+        """Return both outputs and their derivatives, ``(a, b), (a_x, a_y, b_x, b_y)``."""
+        outputs, derivatives = [], []
+        part = np.empty_like(s)
+        n = self.rows.shape[1]
+        for rows in self.rows:
+            total = total_s = total_t = None
+            for p in range(n - 1, -1, -1):
+                inner = rows[p, n - 1].take(cell, mode="clip")
+                inner_t = None
+                for q in range(n - 2, -1, -1):
+                    if inner_t is None:
+                        inner_t = inner.copy()
+                    else:
+                        inner_t *= t
+                        inner_t += inner
+                    inner *= t
+                    rows[p, q].take(cell, out=part, mode="clip")
+                    inner += part
+                if total is None:
+                    total, total_t = inner, inner_t
+                    continue
+                if total_s is None:
+                    total_s = total.copy()
+                else:
+                    total_s *= s
+                    total_s += total
+                total *= s
+                total += inner
+                total_t *= s
+                total_t += inner_t
+            total_s *= 1.0 / self.x_step
+            total_t *= 1.0 / self.y_step
+            outputs.append(total)
+            derivatives += [total_s, total_t]
+        return outputs, derivatives
+
+    def negated(self):
+        """Return the grid with both outputs negated."""
+        coefficients = -self.rows.reshape(*self.rows.shape[:3], self.ny, self.nx)
+        return CellGrid((self.x_low, self.x_high), (self.y_low, self.y_high), coefficients)
+
+    def fold(self, polynomial, origin):
+        """Return a grid of bicubic cells with a polynomial of degree 3 or less added.
+
+        Parameters
+        ----------
+        polynomial : (2, m, m) ndarray
+            In powers of ``x - origin[0]`` and ``y - origin[1]``, m at most 4.
+        origin : (float, float)
+            Reference point.
+
+        Returns
+        -------
+        grid : CellGrid
+            The sum, in cells of 4 x 4 coefficients.
+        """
+        m = polynomial.shape[1]
+        shifts = []
+        for low, step, n, centre in (
+            (self.x_low, self.x_step, self.nx, origin[0]),
+            (self.y_low, self.y_step, self.ny, origin[1]),
+        ):
+            edge = low - centre + step * np.arange(n)
+            shift = np.zeros((n, m, m))
+            for p in range(m):
+                for a in range(p + 1):
+                    shift[:, a, p] = comb(p, a) * edge ** (p - a) * step**a
+            shifts.append(shift)
+        local = np.einsum("iap,jbq,kpq->kabji", *shifts, polynomial, optimize=True)
+        n = self.rows.shape[1]
+        total = np.zeros((2, 4, 4, self.ny, self.nx))
+        total[:, :n, :n] += self.rows.reshape(2, n, n, self.ny, self.nx)
+        total[:, :m, :m] += local
+        return CellGrid((self.x_low, self.x_high), (self.y_low, self.y_high), total)
+
+
+class PlaneMap:
+    """A smooth map of the plane: polynomial, radial terms and cells, summed.
+
+    Parameters
+    ----------
+    polynomial : (2, n, n) ndarray, optional
+        ``polynomial[k, p, q]`` multiplies ``u**p v**q``, where (u, v) is (x, y) minus the origin.
+    origin : (float, float), optional
+        Reference point of the polynomial.
+    radial : (2, m) ndarray, optional
+        ``radial[k, s]`` multiplies ``r**s`` in output k.
+    radial_matrix : (2, 2) ndarray, optional
+        r is the length of ``radial_matrix @ (u, v)``.
+    grid : CellGrid, optional
+        Added to the polynomial.  The map is NaN outside it.
+    """
+
+    def __init__(
+        self, polynomial=None, origin=(0.0, 0.0), *, radial=None, radial_matrix=None, grid=None
+    ):
+        foldable = polynomial is not None and polynomial.shape[1] <= 4 and radial is None
+        if grid is not None and foldable:
+            grid = grid.fold(polynomial, origin)
+            polynomial = None
+        self.polynomial = polynomial
+        self.origin = (float(origin[0]), float(origin[1]))
+        self.radial = radial
+        self.radial_matrix = np.eye(2) if radial_matrix is None else radial_matrix
+        self.grid = grid
+        if polynomial is not None:
+            self.derivatives = [(_derivative(c, 0), _derivative(c, 1)) for c in polynomial]
+
+    def _radius(self, u, v):
+        m = self.radial_matrix
+        a = m[0, 0] * u + m[0, 1] * v
+        b = m[1, 0] * u + m[1, 1] * v
+        return a, b, np.sqrt(a * a + b * b)
+
+    def __call__(self, x, y):
+        """Map a block of points.
+
+        Parameters
+        ----------
+        x, y : (N,) ndarray
+            Points.
+
+        Returns
+        -------
+        a, b : (N,) ndarray
+            Their images; NaN outside the grid.
+        """
+        a = b = 0.0
+        if self.polynomial is not None:
+            u, v = x - self.origin[0], y - self.origin[1]
+            a, b = (_horner(c, u, v) for c in self.polynomial)
+            if self.radial is not None:
+                r = self._radius(u, v)[2]
+                a += np.polynomial.polynomial.polyval(r, self.radial[0])
+                b += np.polynomial.polynomial.polyval(r, self.radial[1])
+        if self.grid is not None:
+            cell, s, t, outside = self.grid.locate(x, y)
+            ga, gb = self.grid.evaluate(cell, s, t)
+            ga += a
+            gb += b
+            a, b = ga, gb
+            if outside is not None:
+                a[outside] = np.nan
+                b[outside] = np.nan
+        return a, b
+
+    def jacobian(self, x, y, margin=0.0):
+        """Map a block of points and differentiate.
+
+        Parameters
+        ----------
+        x, y : (N,) ndarray
+            Points.
+        margin : float, optional
+            How far outside the grid its outermost cells are still used.
+
+        Returns
+        -------
+        values : (a, b)
+            Images of the points.
+        derivatives : (a_x, a_y, b_x, b_y)
+            Their derivatives by x and y.
+        """
+        values = [np.zeros_like(x), np.zeros_like(x)]
+        derivatives = [np.zeros_like(x) for _ in range(4)]
+        if self.polynomial is not None:
+            u, v = x - self.origin[0], y - self.origin[1]
+            values = [_horner(c, u, v) for c in self.polynomial]
+            derivatives = [_horner(d, u, v) for pair in self.derivatives for d in pair]
+            if self.radial is not None:
+                m = self.radial_matrix
+                a, b, r = self._radius(u, v)
+                # r is not differentiable at 0; its one-sided slopes average to nothing there.
+                inverse = np.divide(1.0, r, out=np.zeros_like(r), where=r > 0)
+                r_x = (a * m[0, 0] + b * m[1, 0]) * inverse
+                r_y = (a * m[0, 1] + b * m[1, 1]) * inverse
+                for k in (0, 1):
+                    values[k] += np.polynomial.polynomial.polyval(r, self.radial[k])
+                    slope = np.polynomial.polynomial.polyval(
+                        r, np.polynomial.polynomial.polyder(self.radial[k])
+                    )
+                    derivatives[2 * k] += slope * r_x
+                    derivatives[2 * k + 1] += slope * r_y
+        if self.grid is not None:
+            cell, s, t, outside = self.grid.locate(x, y, margin)
+            grid_values, grid_derivatives = self.grid.evaluate_jacobian(cell, s, t)
+            values = [g + v for g, v in zip(grid_values, values, strict=True)]
+            derivatives = [g + d for g, d in zip(grid_derivatives, derivatives, strict=True)]
+            if outside is not None:
+                for value in (*values, *derivatives):
+                    value[outside] = np.nan
+        return values, derivatives
+
+    def invert(self, a, b, x, y, *, tolerance):
+        """Invert a block of points by Newton's method with the analytic Jacobian.
+
+        Parameters
+        ----------
+        a, b : (N,) ndarray
+            Images to invert.
+        x, y : (N,) ndarray
+            Where to start.
+        tolerance : float
+            Greatest residual of the map at the answer, in units of a and b.
+
+        Returns
+        -------
+        x, y : (N,) ndarray
+            The points, each verified by its residual; NaN where there is none.
+
+        Notes
+        -----
+        Iterates stay on the grid: for a point that lies on it the way is only shortened by that, and a
+        point that lies outside is left with a residual and becomes NaN.  (They may leave it by 1e-6 px,
+        since rounding moves points of the rim; such an answer is put on the rim.)  A point where the Jacobian
+        determinant is not positive (the image is folded over there) is no answer either.
+        """
+        x_out, y_out = np.full(a.shape, np.nan), np.full(a.shape, np.nan)
+        index = np.flatnonzero(np.isfinite(a) & np.isfinite(b))
+        whole = len(index) == len(a)
+        a, b, x, y = (np.array(value if whole else value[index]) for value in (a, b, x, y))
+        self._clip(x, y)
+        # Rounding of the map itself sets the floor.
+        limit = tolerance + 16 * np.finfo(float).eps * np.maximum(np.abs(a), np.abs(b))
+        with np.errstate(all="ignore"):
+            for _ in range(_MAX_NEWTON):
+                if not len(index):
+                    break
+                (fa, fb), (a_x, a_y, b_x, b_y) = self.jacobian(x, y, _RIM)
+                np.subtract(a, fa, out=fa)
+                np.subtract(b, fb, out=fb)
+                determinant = a_x * b_y
+                determinant -= a_y * b_x
+                done = np.abs(fa) <= limit
+                done &= np.abs(fb) <= limit
+                n_done = np.count_nonzero(done)
+                if n_done:
+                    answer = done & (determinant > 0)
+                    x_out[index[answer]] = x[answer]
+                    y_out[index[answer]] = y[answer]
+                if n_done == len(index):
+                    break
+                b_y *= fa
+                a_y *= fb
+                b_y -= a_y
+                b_y /= determinant
+                a_x *= fb
+                b_x *= fa
+                a_x -= b_x
+                a_x /= determinant
+                x_new, y_new = x + b_y, y + a_x
+                self._clip(x_new, y_new, _RIM)
+                # A point that no longer moves, or left for infinity, has no answer.
+                going = (x_new != x) | (y_new != y)
+                going &= np.isfinite(x_new) & np.isfinite(y_new)
+                going &= ~done
+                if going.all():
+                    x, y = x_new, y_new
+                else:
+                    a, b, limit, index = (value[going] for value in (a, b, limit, index))
+                    x, y = x_new[going], y_new[going]
+        self._clip(x_out, y_out)
+        return x_out, y_out
+
+    def _clip(self, x, y, margin=0.0):
+        if self.grid is not None:
+            np.clip(x, self.grid.x_low - margin, self.grid.x_high + margin, out=x)
+            np.clip(y, self.grid.y_low - margin, self.grid.y_high + margin, out=y)

@@ -1,0 +1,313 @@
+"""The tangent plane: gnomonic projection about a point of the sky, and its model."""
+
+import numpy as np
+from astropy.modeling import Model, Parameter
+
+from wpdc_gwcs.models.blocks import evaluate_blocks
+
+__all__ = ["SkyTangent", "TangentSky", "deproject", "project"]
+
+
+class _Tangent:
+    """Gnomonic projection about one point, on contiguous blocks."""
+
+    def __init__(self, crval):
+        self.ra0, self.dec0 = (float(value) for value in crval)
+        self.sin0, self.cos0 = np.sin(np.radians(self.dec0)), np.cos(np.radians(self.dec0))
+
+    def project(self, ra, dec):
+        """Sky in degrees to the plane in degrees, NaN on the far hemisphere."""
+        angle = ra - self.ra0
+        angle *= np.pi / 180
+        dec = dec * (np.pi / 180)
+        cos_dec = np.cos(dec)
+        sin_dec = np.sin(dec)
+        xi = np.sin(angle)
+        xi *= cos_dec
+        toward = np.cos(angle, out=angle)
+        toward *= cos_dec
+        depth = self.sin0 * sin_dec
+        depth += self.cos0 * toward
+        sin_dec *= self.cos0
+        toward *= self.sin0
+        sin_dec -= toward
+        # The horizon itself is infinitely far away.
+        depth[~(depth > 1e-12)] = np.nan
+        np.divide(180 / np.pi, depth, out=depth)
+        xi *= depth
+        sin_dec *= depth
+        return xi, sin_dec
+
+    def deproject(self, xi, eta):
+        """Plane in degrees to the sky in degrees; right ascension from 0 to 360."""
+        xi = xi * (np.pi / 180)
+        # Axes of the tangent plane's point: toward RA0 in the equator's plane, east, and north.
+        eta = eta * (np.pi / 180)
+        ahead = eta * -self.sin0
+        ahead += self.cos0
+        north = eta
+        north *= self.cos0
+        north += self.sin0
+        ra = np.arctan2(xi, ahead)
+        xi *= xi
+        ahead *= ahead
+        xi += ahead
+        np.sqrt(xi, out=xi)
+        dec = np.arctan2(north, xi, out=north)
+        dec *= 180 / np.pi
+        ra *= 180 / np.pi
+        ra += self.ra0
+        if len(ra) and not (ra.min() >= 0.0 and ra.max() < 360.0):
+            np.mod(ra, 360.0, out=ra)
+            # A tiny negative angle is rounded up to 360 by the modulus.
+            ra[ra == 360.0] = 0.0
+        return ra, dec
+
+
+def project(ra, dec, crval):
+    """Project the sky onto the plane that touches it at a point (gnomonic, TAN).
+
+    Parameters
+    ----------
+    ra, dec : array_like
+        Positions in degrees.
+    crval : (float, float)
+        Tangent point in degrees.
+
+    Returns
+    -------
+    xi, eta : ndarray
+        Standard coordinates in degrees, east and north; NaN for points 90 degrees or more from the
+        tangent point.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import project
+    >>> xi, eta = project(10.0, 21.0, (10.0, 20.0))
+    >>> float(xi), float(eta)
+    (0.0, 1.0001015)
+    """
+    return evaluate_blocks(_Tangent(crval).project, ra, dec)
+
+
+def deproject(xi, eta, crval):
+    """Project the plane that touches the sky at a point back onto the sky (gnomonic, TAN).
+
+    Parameters
+    ----------
+    xi, eta : array_like
+        Standard coordinates in degrees, east and north.
+    crval : (float, float)
+        Tangent point in degrees.
+
+    Returns
+    -------
+    ra, dec : ndarray
+        Positions in degrees, right ascension from 0 to 360.
+
+    Notes
+    -----
+    With xi, eta in radians::
+
+        tan(ra - ra0) = xi / (cos dec0 - eta sin dec0)
+        tan(dec) = (sin dec0 + eta cos dec0) / hypot(xi, cos dec0 - eta sin dec0)
+
+    which is exact at the poles, too.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import deproject
+    >>> ra, dec = deproject(0.0, 1.0, (10.0, 89.5))
+    >>> float(ra), float(dec)
+    (190.0, 89.5001)
+    """
+    return evaluate_blocks(_Tangent(crval).deproject, xi, eta)
+
+
+def _check_linear(crpix, cd, crval):
+    crpix, cd, crval = (np.array(value, dtype=float) for value in (crpix, cd, crval))
+    for label, value, shape in (("crpix", crpix, (2,)), ("cd", cd, (2, 2)), ("crval", crval, (2,))):
+        if value.shape != shape:
+            raise ValueError(f"{label} must have the shape {shape}, not {value.shape}")
+        if not np.all(np.isfinite(value)):
+            raise ValueError(f"{label} must be finite, not {value.tolist()}")
+    if abs(crval[1]) > 90:
+        raise ValueError(f"the declination in crval must lie between -90 and 90, not {crval[1]}")
+    check_invertible("cd", cd)
+    return crpix, cd, crval
+
+
+def check_invertible(label, matrix):
+    """Raise an error unless a 2 x 2 matrix can be inverted without losing all digits.
+
+    Parameters
+    ----------
+    label : str
+        Name of the argument for the message.
+    matrix : (2, 2) ndarray
+        The matrix.
+
+    Raises
+    ------
+    ValueError
+        If it is singular.
+    """
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    if not singular[1] > 1e-10 * singular[0]:
+        raise ValueError(f"{label} must be invertible, not {np.asarray(matrix).tolist()}")
+
+
+class _Linear(Model):
+    """Common ground of the tangent-plane model and its inverse: the parameters."""
+
+    crpix = Parameter(default=[0.0, 0.0], description="reference point, zero-based pixels")
+    cd = Parameter(default=[[1.0, 0.0], [0.0, 1.0]], description="degrees per pixel")
+    crval = Parameter(default=[0.0, 0.0], description="tangent point in degrees")
+
+    n_inputs = 2
+    n_outputs = 2
+    _separable = False
+    standard_broadcasting = False
+
+    def __init__(self, crpix=(0.0, 0.0), cd=((1.0, 0.0), (0.0, 1.0)), crval=(0.0, 0.0), **kwargs):
+        crpix, cd, crval = _check_linear(crpix, cd, crval)
+        super().__init__(crpix=crpix, cd=cd, crval=crval, **kwargs)
+        pixel, sky = ("x_undistorted", "y_undistorted"), ("ra", "dec")
+        self.inputs, self.outputs = (pixel, sky) if self._to_sky else (sky, pixel)
+
+    @staticmethod
+    def _arrays(crpix, cd, crval):
+        return np.reshape(crpix, 2), np.reshape(cd, (2, 2)), np.reshape(crval, 2)
+
+
+class TangentSky(_Linear):
+    """Undistorted pixels to the sky: linear to the tangent plane, then gnomonic.
+
+    Parameters
+    ----------
+    crpix : (float, float)
+        Reference point in zero-based pixels, (x, y).
+    cd : (2, 2) array_like
+        Matrix from pixels to the tangent plane, degrees per pixel.
+    crval : (float, float)
+        Right ascension and declination of the tangent point in degrees.
+    **kwargs
+        ``name`` and ``meta`` of the model.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, a number is not finite or ``cd`` is singular.
+
+    Notes
+    -----
+    The native pole stands at LONPOLE = 180 deg at every declination.  (FITS makes 0 the default at a
+    declination of exactly +90 deg; such a header has to be turned by half a circle.)
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import TangentSky
+    >>> sky = TangentSky(crpix=(99.5, 99.5), cd=[[-1e-4, 0], [0, 1e-4]], crval=(0.0, 60.0))
+    >>> ra, dec = sky(109.5, 99.5)
+    >>> float(ra), float(dec)
+    (359.998, 59.9999999)
+    """
+
+    _to_sky = True
+
+    def evaluate(self, x, y, crpix, cd, crval):
+        """Map undistorted pixels to the sky.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Undistorted pixel coordinates, zero based.
+        crpix, cd, crval : array_like
+            The parameters.
+
+        Returns
+        -------
+        ra, dec : ndarray
+            Positions in degrees, right ascension from 0 to 360.
+        """
+        return evaluate_blocks(self._block_function(crpix, cd, crval), x, y)
+
+    def _block_function(self, crpix, cd, crval):
+        (x0, y0), ((m00, m01), (m10, m11)), crval = self._arrays(crpix, cd, crval)
+        tangent = _Tangent(crval)
+
+        def to_sky(x, y):
+            u, v = x - x0, y - y0
+            xi = m00 * u
+            xi += m01 * v
+            u *= m10
+            v *= m11
+            v += u
+            return tangent.deproject(xi, v)
+
+        return to_sky
+
+    @property
+    def inverse(self):
+        """The exact inverse (a `SkyTangent`)."""
+        return SkyTangent(self.crpix.value, self.cd.value, self.crval.value)
+
+
+class SkyTangent(_Linear):
+    """The sky to undistorted pixels: the inverse of `TangentSky`, with the same parameters.
+
+    NaN for points 90 degrees or more from the tangent point.
+
+    Parameters
+    ----------
+    crpix : (float, float)
+        Reference point in zero-based pixels, (x, y).
+    cd : (2, 2) array_like
+        Matrix from pixels to the tangent plane, degrees per pixel.
+    crval : (float, float)
+        Right ascension and declination of the tangent point in degrees.
+    **kwargs
+        ``name`` and ``meta`` of the model.
+    """
+
+    _to_sky = False
+
+    def evaluate(self, ra, dec, crpix, cd, crval):
+        """Map the sky to undistorted pixels.
+
+        Parameters
+        ----------
+        ra, dec : array_like
+            Positions in degrees.
+        crpix, cd, crval : array_like
+            The parameters.
+
+        Returns
+        -------
+        x, y : ndarray
+            Undistorted pixel coordinates, zero based.
+        """
+        return evaluate_blocks(self._block_function(crpix, cd, crval), ra, dec)
+
+    def _block_function(self, crpix, cd, crval):
+        (x0, y0), cd, crval = self._arrays(crpix, cd, crval)
+        (m00, m01), (m10, m11) = np.linalg.inv(cd)
+        tangent = _Tangent(crval)
+
+        def to_pixels(ra, dec):
+            xi, eta = tangent.project(ra, dec)
+            x = m00 * xi
+            x += m01 * eta
+            x += x0
+            xi *= m10
+            eta *= m11
+            eta += xi
+            eta += y0
+            return x, eta
+
+        return to_pixels
+
+    @property
+    def inverse(self):
+        """The model from undistorted pixels to the sky (a `TangentSky`)."""
+        return TangentSky(self.crpix.value, self.cd.value, self.crval.value)
