@@ -24,12 +24,13 @@ class DetectorWCS(WCS):
 
     It differs from its base class in these points only:
 
-    - `invert` (and with it ``world_to_pixel``) does not mask positions by the range of right ascension and
-      declination of the detector's corners, which loses good points wherever the image of the detector is
-      not a rectangle on the sky, up to all of them at a pole.  Every answer comes from an exact inverse;
-      those that lie outside the bounding box are masked, both coordinates together, and answers within
-      1e-6 px of the rim count as on it.
-    - The two steps are evaluated in one pass, and the bounding box is applied afterwards, in one pass too.
+    - `invert` (and with it ``world_to_pixel``) does not mask positions by the range of right
+      ascension and declination of the detector's corners, which loses good points wherever the
+      image of the detector is not a rectangle on the sky, up to all of them at a pole.  Every
+      answer comes from an exact inverse; those that lie outside the bounding box are masked, both
+      coordinates together, and answers within 1e-6 px of the rim count as on it.
+    - The two steps are evaluated in one pass, and the bounding box is applied afterwards, in one
+      pass too.
 
     All else, including the parameters, is that of the base class.
     """

@@ -2,7 +2,7 @@
 
 ::
 
-    inputs (any shape) --broadcast, ravel--> blocks of BLOCK_SIZE --function, in threads--> outputs (same shape)
+    inputs (any shape) --broadcast--> blocks --function, in threads--> outputs (same shape)
 """
 
 import os
@@ -28,7 +28,7 @@ def _n_threads():
 
 
 def run_blocks(function, size, *, step=BLOCK_SIZE, threaded=None):
-    """Call ``function(start, stop)`` over ``range(size)`` in blocks, in threads when there are many.
+    """Call ``function(start, stop)`` over ``range(size)`` in blocks, threaded when there are many.
 
     Parameters
     ----------
@@ -55,8 +55,8 @@ def run_blocks(function, size, *, step=BLOCK_SIZE, threaded=None):
         for start in starts[first::n_threads]:
             function(start, min(start + step, size))
 
-    # A pool of its own for each call: nothing outlives the call, so forked children and nested calls are
-    # safe, and starting two threads costs less than one block.
+    # A pool of its own for each call: nothing outlives the call, so forked children and nested
+    # calls are safe, and starting two threads costs less than one block.
     with ThreadPoolExecutor(n_threads) as pool:
         list(pool.map(work, range(n_threads)))
 

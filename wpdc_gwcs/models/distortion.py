@@ -1,12 +1,12 @@
-"""Step 1 of the WCS, detector to undistorted pixels, and its fusion with the tangent plane.
+r"""Step 1 of the WCS, detector to undistorted pixels, and its fusion with the tangent plane.
 
 ::
 
     detector px --CRPIX shift, CD, PV, CD^-1, shift back--+
           |                                              (-)--> undistorted px --TangentSky--> sky
           +---------------LookupTable---------------------+
-    \\_______________ DistortionCorrection _______________/
-    \\_________________________________ DetectorToSky _________________________________/
+    \_______________ DistortionCorrection _______________/
+    \_________________________________ DetectorToSky _________________________________/
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.models.lookup_table import LookupTable
 from wpdc_gwcs.models.mapping import PlaneMap, expand_pv
 from wpdc_gwcs.models.polynomial import PVPolynomial
-from wpdc_gwcs.models.tangent import TangentSky, check_invertible
+from wpdc_gwcs.models.tangent import check_invertible
 
 __all__ = ["DetectorToSky", "DistortionCorrection", "DistortionInverse", "SkyToDetector"]
 
@@ -53,16 +53,17 @@ class DistortionCorrection(Model):
 
         X' = CD^-1 PV(CD (x - CRPIX)) + CRPIX - table(x)
 
-    This is ``pv_chain - lookup_table`` of ordinary model arithmetic (`composed` returns it), evaluated in
-    one pass: in each cell of the table the whole of it is one bicubic polynomial.  `DetectorToSky` takes
-    the tangent plane into the same pass.
+    This is ``pv_chain - lookup_table`` of ordinary model arithmetic (`composed` returns it),
+    evaluated in one pass: in each cell of the table the whole of it is one bicubic polynomial.
+    `DetectorToSky` takes the tangent plane into the same pass.
 
     Outside the table's nodes it is NaN; without a table it is defined everywhere.
 
     Examples
     --------
     >>> from wpdc_gwcs.models import DistortionCorrection, PVPolynomial
-    >>> model = DistortionCorrection((49.5, 49.5), [[-1e-4, 0], [0, 1e-4]], PVPolynomial(pv1_0=2e-4))
+    >>> pv = PVPolynomial(pv1_0=2e-4)
+    >>> model = DistortionCorrection((49.5, 49.5), [[-1e-4, 0], [0, 1e-4]], pv)
     >>> x, y = model(10.0, 20.0)
     >>> float(x), float(y)
     (8.0, 20.0)
@@ -121,7 +122,7 @@ class DistortionCorrection(Model):
 
     @property
     def composed(self):
-        """The same as a compound model of simple parts, ``pv_chain - lookup_table``: slow but plain."""
+        """The same as a compound of simple parts, ``pv_chain - lookup_table``: plain but slow."""
         from astropy.modeling.models import AffineTransformation2D, Identity
 
         matrix, crpix = self.cd.value, self.crpix.value
@@ -134,7 +135,7 @@ class DistortionCorrection(Model):
         return chain - self._lookup_table
 
     def _plane_map(self, crpix=None, cd=None):
-        """The map on blocks, kept until a parameter, the polynomial or the table changes."""
+        """Return the map on blocks, kept until a parameter, the polynomial or the table changes."""
         if crpix is None:
             crpix, cd = self.crpix.value, self.cd.value
         pv = self._pv
@@ -178,7 +179,7 @@ class DistortionCorrection(Model):
         return evaluate_blocks(self._plane_map(crpix, cd), x, y)
 
     def jacobian(self, x, y):
-        """Derivatives of both outputs by both inputs.
+        """Return the derivatives of both outputs by both inputs.
 
         Parameters
         ----------
@@ -201,10 +202,10 @@ class DistortionCorrection(Model):
 
 
 class DistortionInverse(Model):
-    """Undistorted pixels to detector pixels: the inverse of `DistortionCorrection` by Newton's method.
+    """Undistorted to detector pixels: the inverse of `DistortionCorrection`, by Newton's method.
 
-    Every answer has been verified by its residual (1e-10 px).  NaN where there is none, which includes
-    all points whose answer would lie outside the table's nodes.
+    Every answer has been verified by its residual (1e-10 px).  NaN where there is none, which
+    includes all points whose answer would lie outside the table's nodes.
 
     Parameters
     ----------

@@ -25,8 +25,8 @@ def _check_grid(name, grid, least):
     step = (grid[-1] - grid[0]) / (len(grid) - 1)
     if not step > 0 or np.any(np.abs(steps - step) > 1e-6 * step):
         raise ValueError(
-            f"{name} must be increasing and equally spaced; its steps range from {steps.min():.9g} to "
-            f"{steps.max():.9g}"
+            f"{name} must be increasing and equally spaced; its steps range from "
+            f"{steps.min():.9g} to {steps.max():.9g}"
         )
     grid.flags.writeable = False
     return grid
@@ -42,8 +42,8 @@ class LookupTable(Model):
     dx, dy : (ny, nx) array_like
         Displacements at the nodes in pixels, indexed ``[iy, ix]``.
     method : {"cubic", "linear"}, keyword-only
-        ``"cubic"``: interpolating bicubic spline through the nodes (not-a-knot ends), continuous to the
-        second derivative; needs four nodes along each axis.  ``"linear"``: bilinear; needs two.
+        ``"cubic"``: interpolating bicubic spline through the nodes (not-a-knot ends), continuous to
+        the second derivative; needs four nodes along each axis.  ``"linear"``: bilinear; needs two.
     **kwargs
         ``name`` and ``meta`` of the model.
 
@@ -54,8 +54,8 @@ class LookupTable(Model):
 
     Notes
     -----
-    Phase 2 of WPDC-2P: ``X'' = X' - dX(x, y)``, ``Y'' = Y' - dY(x, y)``.  The nodes run from the outer
-    edge of the detector to the other, -0.5 ... n - 0.5.  Outside the nodes the model is NaN.
+    Phase 2 of WPDC-2P: ``X'' = X' - dX(x, y)``, ``Y'' = Y' - dY(x, y)``.  The nodes run from the
+    outer edge of the detector to the other, -0.5 ... n - 0.5.  Outside the nodes the model is NaN.
 
     Examples
     --------
@@ -89,13 +89,12 @@ class LookupTable(Model):
         for label, values in (("dx", dx), ("dy", dy)):
             if values.shape != shape:
                 raise ValueError(
-                    f"{label} must have the shape (ny, nx) = {shape} of the grids, not {values.shape}"
+                    f"{label} must have the shape (ny, nx) = {shape} of the grids, not "
+                    f"{values.shape}"
                 )
             if not np.all(np.isfinite(values)):
-                raise ValueError(
-                    f"{label} must be finite at every node; {np.count_nonzero(~np.isfinite(values))} "
-                    "nodes are not"
-                )
+                n_bad = np.count_nonzero(~np.isfinite(values))
+                raise ValueError(f"{label} must be finite at every node; {n_bad} nodes are not")
         self._cache = None
         super().__init__(displacement=np.array([dx, dy]), **kwargs)
         self.inputs = ("x", "y")
@@ -142,8 +141,8 @@ class LookupTable(Model):
             np.linspace(grid[0], grid[-1], len(grid)) for grid in (self._x_grid, self._y_grid)
         )
         if self._method == "cubic":
-            # A tensor product of one-dimensional splines; the power basis of scipy runs from the highest
-            # power down, in units of the grid, and puts (power, cell) first.
+            # A tensor product of one-dimensional splines; the power basis of scipy runs from the
+            # highest power down, in units of the grid, and puts (power, cell) first.
             along_y = CubicSpline(y_grid, displacement, axis=1).c  # q, j, k, x
             both = CubicSpline(x_grid, along_y, axis=3).c  # p, i, q, j, k
             coefficients = np.moveaxis(both[::-1, :, ::-1], (4, 0, 2, 3, 1), (0, 1, 2, 3, 4))
@@ -182,7 +181,7 @@ class LookupTable(Model):
         return evaluate_blocks(PlaneMap(grid=self._cells(displacement)), x, y)
 
     def jacobian(self, x, y):
-        """Derivatives of both outputs by both inputs.
+        """Return the derivatives of both outputs by both inputs.
 
         Parameters
         ----------

@@ -5,9 +5,9 @@
     (x, y) --polynomial (any degree, radial terms)--+--> (a, b)
            --piecewise bicubic on a grid of cells---+
 
-A cubic polynomial is bicubic on each cell of a grid, so where there is a table the polynomial is folded
-into the table's cells and costs nothing.  Everything here takes and returns contiguous float64 blocks;
-models hand over blocks through `wpdc_gwcs.models.blocks`.
+A cubic polynomial is bicubic on each cell of a grid, so where there is a table the polynomial is
+folded into the table's cells and costs nothing.  Everything here takes and returns contiguous
+float64 blocks; models hand over blocks through `wpdc_gwcs.models.blocks`.
 """
 
 from math import comb
@@ -392,10 +392,11 @@ class PlaneMap:
 
         Notes
         -----
-        Iterates stay on the grid: for a point that lies on it the way is only shortened by that, and a
-        point that lies outside is left with a residual and becomes NaN.  (They may leave it by 1e-6 px,
-        since rounding moves points of the rim; such an answer is put on the rim.)  A point where the Jacobian
-        determinant is not positive (the image is folded over there) is no answer either.
+        Iterates stay on the grid: for a point that lies on it the way is only shortened by that,
+        and a point that lies outside is left with a residual and becomes NaN.  (They may leave it
+        by 1e-6 px, since rounding moves points of the rim; such an answer is put on the rim.)  A
+        point where the Jacobian determinant is not positive (the image is folded over there) is no
+        answer either.
         """
         x_out, y_out = np.full(a.shape, np.nan), np.full(a.shape, np.nan)
         index = np.flatnonzero(np.isfinite(a) & np.isfinite(b))

@@ -22,15 +22,15 @@ class PVPolynomial(FittableModel):
     degree : int, optional
         Highest total degree, 1 to 7.
     radial : bool, optional
-        Whether the terms in ``r = hypot(xi, eta)`` (indices 3, 11, 23, 39) are there.  They are read from
-        headers, never fitted.
+        Whether the terms in ``r = hypot(xi, eta)`` (indices 3, 11, 23, 39) are there.  They are
+        read from headers, never fitted.
     name : str, optional
         Name of the model.
     meta : dict, optional
         Anything worth keeping with it.
     **parameters : float or dict
-        Coefficients ``pv1_0``, ``pv1_1``, ..., with FITS indices, and astropy's constraints (``fixed``,
-        ``bounds``).  The default is the identity: ``pv1_1 = pv2_1 = 1``, all others 0.
+        Coefficients ``pv1_0``, ``pv1_1``, ..., with FITS indices, and astropy's constraints
+        (``fixed``, ``bounds``).  The default is the identity: ``pv1_1 = pv2_1 = 1``, all others 0.
 
     Raises
     ------
@@ -82,8 +82,8 @@ class PVPolynomial(FittableModel):
         unknown = set(parameters) - set(names) - {"fixed", "bounds", "tied"}
         if unknown:
             raise TypeError(
-                f"a PV polynomial of degree {degree} {'with' if radial else 'without'} radial terms has "
-                f"no parameter {sorted(unknown)[0]!r}"
+                f"a PV polynomial of degree {degree} {'with' if radial else 'without'} radial "
+                f"terms has no parameter {sorted(unknown)[0]!r}"
             )
         self._param_names = names
         for parameter_name in names:
@@ -95,7 +95,7 @@ class PVPolynomial(FittableModel):
         self.outputs = ("xi_corrected", "eta_corrected")
 
     @classmethod
-    def from_coefficients(cls, coefficients, degree=3, radial=False, **kwargs):
+    def from_coefficients(cls, coefficients, degree=3, radial=False, **kwargs):  # noqa: FBT002
         """Make a polynomial of an array of coefficients.
 
         Parameters
@@ -123,7 +123,8 @@ class PVPolynomial(FittableModel):
         coefficients = np.asarray(coefficients, dtype=float)
         if coefficients.shape != (2, len(terms.index)):
             raise ValueError(
-                f"coefficients must have the shape (2, {len(terms.index)}), not {coefficients.shape}"
+                f"coefficients must have the shape (2, {len(terms.index)}), not "
+                f"{coefficients.shape}"
             )
         parameters = {
             f"pv{axis + 1}_{j}": coefficients[axis, k]
@@ -180,7 +181,7 @@ class PVPolynomial(FittableModel):
         return evaluate_blocks(self._plane_map(coefficients.reshape(2, -1)), xi, eta)
 
     def design_matrix(self, xi, eta):
-        """Derivatives of both outputs by their coefficients, as columns in FITS order.
+        """Return the derivatives of both outputs by their coefficients, as columns in FITS order.
 
         Parameters
         ----------
@@ -215,7 +216,7 @@ class PVPolynomial(FittableModel):
         return tuple(matrices)
 
     def jacobian(self, xi, eta):
-        """Derivatives of both outputs by both inputs.
+        """Return the derivatives of both outputs by both inputs.
 
         Parameters
         ----------

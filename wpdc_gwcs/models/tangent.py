@@ -201,8 +201,8 @@ class TangentSky(_Linear):
 
     Notes
     -----
-    The native pole stands at LONPOLE = 180 deg at every declination.  (FITS makes 0 the default at a
-    declination of exactly +90 deg; such a header has to be turned by half a circle.)
+    The native pole stands at LONPOLE = 180 deg at every declination.  (FITS makes 0 the default at
+    a declination of exactly +90 deg; such a header has to be turned by half a circle.)
 
     Examples
     --------

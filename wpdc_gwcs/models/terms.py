@@ -1,6 +1,6 @@
 """The one table of PV terms: which power of what each FITS ``PVi_j`` multiplies."""
 
-from functools import lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +17,9 @@ _RADIAL_INDEX = {1: 3, 3: 11, 5: 23, 7: 39}
 class PVTerms(NamedTuple):
     """Terms of a PV polynomial, in the order of their FITS index.
 
-    Term ``k`` of axis ``i`` is ``PVi_{index[k]} * a**own[k] * b**other[k] * r**radius[k]``, where ``a`` is
-    the coordinate of axis ``i`` itself (xi for axis 1, eta for axis 2), ``b`` that of the other axis and
-    ``r = hypot(xi, eta)``.
+    Term ``k`` of axis ``i`` is ``PVi_{index[k]} * a**own[k] * b**other[k] * r**radius[k]``, where
+    ``a`` is the coordinate of axis ``i`` itself (xi for axis 1, eta for axis 2), ``b`` that of the
+    other axis and ``r = hypot(xi, eta)``.
     """
 
     index: np.ndarray
@@ -28,8 +28,8 @@ class PVTerms(NamedTuple):
     radius: np.ndarray
 
 
-@lru_cache(maxsize=None)
-def pv_terms(degree, radial=False):
+@cache
+def pv_terms(degree, radial=False):  # noqa: FBT002
     """Return the PV terms up to a degree.
 
     Parameters
@@ -37,7 +37,8 @@ def pv_terms(degree, radial=False):
     degree : int
         Highest total degree, 1 to 7.
     radial : bool, optional
-        Whether the radial terms (``r``, ``r**3``, ``r**5``, ``r**7``: indices 3, 11, 23, 39) are included.
+        Whether the radial terms (``r``, ``r**3``, ``r**5``, ``r**7``: indices 3, 11, 23, 39) are
+        included.
 
     Returns
     -------
@@ -51,8 +52,8 @@ def pv_terms(degree, radial=False):
 
     Notes
     -----
-    The order is that of the TPV convention: ``a``, ``b``, ``r``; ``a**2``, ``a b``, ``b**2``; ``a**3``, ...
-    (https://fits.gsfc.nasa.gov/registry/tpvwcs/tpv.html).
+    The order is that of the TPV convention: ``a``, ``b``, ``r``; ``a**2``, ``a b``, ``b**2``;
+    ``a**3``, ... (https://fits.gsfc.nasa.gov/registry/tpvwcs/tpv.html).
 
     Examples
     --------
