@@ -294,7 +294,7 @@ def select_cone(catalog, ra, dec, radius):
 
 def _read_table(path, format):
     """Read a table from a file; a `CatalogError` whatever goes wrong."""
-    path, extension = _split_extension(path)
+    path, extension = split_extension(path)
     try:
         if not path.exists():
             raise CatalogError(f"{path}: catalogue must be an existing file, found nothing there")
@@ -317,7 +317,7 @@ def _read_table(path, format):
         ) from error
 
 
-def _split_extension(path):
+def split_extension(path):
     """``path[EXT]`` -> path, EXT; a file whose name really ends in brackets is left alone."""
     text = str(path)
     found = re.fullmatch(r"(.+)\[([^\[\]]+)\]", text)

@@ -1,0 +1,25 @@
+"""Files, and nothing else: frames, headers, calibrations, solutions and tables in and out.
+
+::
+
+    FITS image, FITS_LDAC, table --read_frames--> Frame ... chain ... --write--> ASDF, FITS, .head,
+    ECSV
+                                                  Calibration <--read--
+"""
+
+from wpdc_gwcs.io.files import OutputExistsError
+from wpdc_gwcs.io.formats import FORMATS, read, read_wcs, write
+from wpdc_gwcs.io.frames import read_frames
+from wpdc_gwcs.io.tables import read_matches, read_table, write_table
+
+__all__ = [
+    "FORMATS",
+    "OutputExistsError",
+    "read",
+    "read_frames",
+    "read_matches",
+    "read_table",
+    "read_wcs",
+    "write",
+    "write_table",
+]

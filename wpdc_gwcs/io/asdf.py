@@ -1,0 +1,289 @@
+"""Calibrations and solutions as ASDF: a stock gwcs for everyone, a plain tree for an exact return.
+
+::
+
+    {"wcs": gwcs in stock models,
+     "wpdc": {format_version, kind, ...}}
+
+Layout of ``wpdc``, format version 1.0.0 (arrays are core ASDF arrays, all else plain YAML):
+
+======================= ========================================================================
+``format_version``      "1.0.0"
+``kind``                "solution" or "calibration"
+``software``            name and version of the writer
+``solution``            the instrument, see below
+``frame``               of a calibration: name of the frame, and with it ``crval``, ``cd``,
+                        ``attitude_covariance``, ``statistics``, ``settings``, ``provenance``
+======================= ========================================================================
+
+``solution`` has ``detector``, ``image_shape`` (ny, nx), ``crpix`` (zero based), ``cd``, ``crval``,
+``pv`` (``degree``, ``radial``, ``indices``, ``coefficients``), ``lookup_table`` (``method``,
+``x_grid``, ``y_grid``, ``dx``, ``dy``) or null, ``pv_covariance``, ``table_sigma``,
+``residual_map`` (solution files only), ``statistics``, ``settings``, ``provenance``.  Matches and
+sources have tables of their own.
+"""
+
+import dataclasses
+import warnings
+from pathlib import Path
+
+import asdf
+import numpy as np
+
+from wpdc_gwcs.exceptions import FileFormatError, InputError
+from wpdc_gwcs.io.files import READ_ERRORS, atomic_path, first_line
+from wpdc_gwcs.lookup import ResidualMap
+from wpdc_gwcs.models import LookupTable, PVPolynomial
+from wpdc_gwcs.solution import Calibration, DistortionSolution
+
+__all__ = ["FORMAT_VERSION", "read_asdf", "read_asdf_wcs", "write_asdf", "write_stock"]
+
+FORMAT_VERSION = "1.0.0"
+# Tables with files of their own, and what only the file of the detector itself needs.
+_NOT_STORED = {"matches", "sources"}
+_NOT_IN_FRAMES = {"residual_map"}
+_SHAPES = {"crpix": (2,), "crval": (2,), "cd": (2, 2)}
+
+
+def write_asdf(obj, path, *, overwrite=False):
+    """Write a calibration or a solution.
+
+    Parameters
+    ----------
+    obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
+        What to write.
+    path : path-like
+        File to write.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+    """
+    from wpdc_gwcs import __version__
+    from wpdc_gwcs.wcs import to_stock_wcs
+
+    tree = {"format_version": FORMAT_VERSION}
+    software = {"name": "wpdc_gwcs", "version": __version__}
+    if isinstance(obj, Calibration):
+        tree |= {"kind": "calibration", "software": software, **_fields_of(obj, _NOT_STORED)}
+    else:
+        tree |= {"kind": "solution", "software": software, "solution": _fields_of(obj, set())}
+    _write_tree({"wcs": to_stock_wcs(obj.wcs), "wpdc": tree}, path, overwrite)
+
+
+def write_stock(obj, path, *, overwrite=False):
+    """Write the stock gwcs alone.
+
+    Parameters
+    ----------
+    obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
+        What to write.
+    path : path-like
+        File to write.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Returns
+    -------
+    deviation : float
+        Its greatest deviation from the exact WCS, px; `None` if the shape of the detector is
+        unknown.
+    """
+    from wpdc_gwcs.io.fits import deviation
+    from wpdc_gwcs.wcs import to_stock_wcs
+
+    wcs = to_stock_wcs(obj.wcs)
+    _write_tree({"wcs": wcs}, path, overwrite)
+    shape = obj.solution.image_shape if isinstance(obj, Calibration) else obj.image_shape
+    return None if shape is None else deviation(obj, wcs, n=101)
+
+
+def read_asdf(path):
+    """Read a calibration or a solution.
+
+    Parameters
+    ----------
+    path : path-like
+        File that `write_asdf` wrote.
+
+    Returns
+    -------
+    obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
+        As written, with the fast WCS; without matches and sources.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged, of a newer format version or not of this kind.
+    """
+    tree = _read_tree(path)
+    tree = tree.get("wpdc")
+    if not isinstance(tree, dict):
+        raise FileFormatError(f"{path}: must have a 'wpdc' tree, has none: not a wpdc_gwcs file")
+    _check_version(tree, path)
+    kind = tree.get("kind")
+    if kind not in ("solution", "calibration"):
+        raise FileFormatError(f"{path}: kind must be 'solution' or 'calibration', got {kind!r}")
+    try:
+        solution = _object_of(DistortionSolution, _entry(tree, "solution", path), path)
+        if kind == "solution":
+            return solution
+        return _object_of(Calibration, {**tree, "solution": solution}, path)
+    except InputError:
+        raise
+    except READ_ERRORS as problem:
+        raise FileFormatError(f"{path}: damaged 'wpdc' tree: {first_line(problem)}") from problem
+
+
+def read_asdf_wcs(path):
+    """Read the ``wcs`` of any ASDF file.
+
+    Parameters
+    ----------
+    path : path-like
+        ASDF file.
+
+    Returns
+    -------
+    wcs : `~gwcs.wcs.WCS`
+        As stored.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged or has no ``wcs``.
+    """
+    wcs = _read_tree(path).get("wcs")
+    if not hasattr(wcs, "pixel_to_world_values"):
+        raise FileFormatError(f"{path}: must have a 'wcs' that gwcs can open, has none")
+    return wcs
+
+
+def _write_tree(tree, path, overwrite):
+    with atomic_path(path, overwrite=overwrite) as temporary, asdf.config_context() as config:
+        # Small arrays stay legible.
+        config.array_inline_threshold = 64
+        asdf.AsdfFile(tree).write_to(temporary)
+
+
+def _read_tree(path):
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with asdf.open(path, lazy_load=False, memmap=False) as file:
+                return dict(file.tree)
+    except (asdf.exceptions.ValidationError, *READ_ERRORS) as problem:
+        raise FileFormatError(
+            f"{path}: damaged or truncated ASDF file: {first_line(problem)}"
+        ) from problem
+
+
+def _check_version(tree, path):
+    version = tree.get("format_version")
+    try:
+        given = tuple(int(part) for part in str(version).split("."))
+        if len(given) != 3:
+            raise ValueError(version)
+    except ValueError:
+        raise FileFormatError(
+            f"{path}: format_version must be like {FORMAT_VERSION!r}, got {version!r}"
+        ) from None
+    if given > tuple(int(part) for part in FORMAT_VERSION.split(".")):
+        raise FileFormatError(
+            f"{path}: format version must not be newer than {FORMAT_VERSION}, got {version}: "
+            "a newer wpdc_gwcs is needed"
+        )
+
+
+def _entry(tree, key, path):
+    if key not in tree:
+        raise FileFormatError(f"{path}: 'wpdc' tree must have {key!r}, has {', '.join(tree)}")
+    return tree[key]
+
+
+def _fields_of(obj, left_out):
+    """Give every field of a dataclass as plain tree."""
+    tree = {}
+    for field in dataclasses.fields(obj):
+        if field.name in left_out:
+            continue
+        value = getattr(obj, field.name)
+        if isinstance(value, DistortionSolution):
+            tree[field.name] = _fields_of(value, _NOT_IN_FRAMES)
+        else:
+            tree[field.name] = _plain(value, field.name)
+    return tree
+
+
+def _plain(value, where):
+    """Give a value as what core ASDF knows."""
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        return np.array(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, PVPolynomial):
+        return {
+            "degree": value.degree,
+            "radial": value.radial,
+            "indices": [int(j) for j in value.term_indices],
+            "coefficients": np.array(value.coefficients, float),
+        }
+    if isinstance(value, LookupTable):
+        grids = {k: np.array(getattr(value, k), float) for k in ("x_grid", "y_grid", "dx", "dy")}
+        return {"method": value.method, **grids}
+    if isinstance(value, ResidualMap):
+        return _plain(value.to_tree(), where)
+    if isinstance(value, Path):
+        return str(value)
+    if dataclasses.is_dataclass(value):
+        return _fields_of(value, set())
+    if isinstance(value, dict):
+        return {str(k): _plain(v, f"{where}[{k!r}]") for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(v, f"{where}[{i}]") for i, v in enumerate(value)]
+    raise TypeError(f"{where} must be made of plain values and arrays, got {type(value).__name__}")
+
+
+def _object_of(cls, tree, path):
+    """Build a dataclass from its tree; fields with defaults may be absent."""
+    values = {}
+    for field in dataclasses.fields(cls):
+        required = (
+            field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        )
+        if field.name not in tree and not required:
+            continue
+        value = _entry(tree, field.name, path)
+        if field.name in _SHAPES:
+            value = np.array(value, float)
+            if value.shape != _SHAPES[field.name] or not np.isfinite(value).all():
+                raise FileFormatError(
+                    f"{path}: {field.name} must be finite and of the shape {_SHAPES[field.name]}, "
+                    f"got {value.tolist()}"
+                )
+        elif value is not None and field.name in _READERS:
+            value = _READERS[field.name](value)
+        values[field.name] = value
+    return cls(**values)
+
+
+def _read_pv(tree):
+    pv = PVPolynomial.from_coefficients(
+        np.array(tree["coefficients"], float), degree=tree["degree"], radial=tree["radial"]
+    )
+    if [int(j) for j in pv.term_indices] != list(tree["indices"]):
+        raise ValueError(f"PV indices do not belong to degree {tree['degree']}: {tree['indices']}")
+    return pv
+
+
+def _read_table(tree):
+    grids = (np.array(tree[k], float) for k in ("x_grid", "y_grid", "dx", "dy"))
+    return LookupTable(*grids, method=tree["method"])
+
+
+_READERS = {
+    "pv": _read_pv,
+    "lookup_table": _read_table,
+    "residual_map": ResidualMap.from_tree,
+    "image_shape": lambda shape: tuple(int(n) for n in shape),
+}

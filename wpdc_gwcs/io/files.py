@@ -1,0 +1,351 @@
+"""Files as such: what kind, complete or not, and writing without leaving halves behind."""
+
+import bz2
+import contextlib
+import gzip
+import lzma
+import os
+import re
+import uuid
+import warnings
+import zlib
+from pathlib import Path
+
+from astropy.io import fits
+
+from wpdc_gwcs.catalogs import split_extension
+from wpdc_gwcs.exceptions import FileFormatError, InputError
+
+__all__ = [
+    "READ_ERRORS",
+    "OutputExistsError",
+    "atomic_path",
+    "check_output",
+    "file_kind",
+    "first_line",
+    "open_fits",
+    "split_extension",
+    "stem_of",
+]
+
+# What astropy, asdf and the decompressors raise on damaged files.
+READ_ERRORS = (
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    RuntimeError,
+    ArithmeticError,
+    lzma.LZMAError,
+    zlib.error,
+    fits.VerifyError,
+)
+_BLOCK = 2880
+_OPENERS = {"gzip": gzip.open, "bzip2": bz2.open, "xz": lzma.open}
+_MAGIC = (
+    (b"\x1f\x8b", "gzip"),
+    (b"BZh", "bzip2"),
+    (b"\xfd7zXZ\x00", "xz"),
+    (b"#ASDF", "asdf"),
+    (b"SIMPLE  =", "fits"),
+)
+_FITS_NAME = re.compile(r"\.(fits?|fts|fz)(\.(gz|bz2|xz))?$", re.IGNORECASE)
+_HEADER_NAME = re.compile(r"\.(a?head|hdr|txt)$", re.IGNORECASE)
+_STEM_SUFFIXES = re.compile(
+    r"\.(fz|gz|bz2|xz|fits?|fts|cat|ldac|ecsv|csv|txt|dat|tbl|head|asdf)$", re.IGNORECASE
+)
+
+
+class OutputExistsError(InputError, FileExistsError):
+    """A file that would be written is there already and may not be replaced."""
+
+
+def first_line(error):
+    """Give the first line of an error's message, for messages of one line."""
+    return str(error).strip().split("\n")[0] or type(error).__name__
+
+
+def stem_of(path):
+    """Give the name of a file without its folder and without the endings of data files.
+
+    Parameters
+    ----------
+    path : path-like
+        For example ``night1/a.fits.fz``.
+
+    Returns
+    -------
+    stem : str
+        For example ``a``.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.io.files import stem_of
+    >>> stem_of("night1/a.1.fits.fz")
+    'a.1'
+    """
+    name = Path(path).name
+    while (shorter := _STEM_SUFFIXES.sub("", name)) not in ("", name):
+        name = shorter
+    return name
+
+
+def file_kind(path, *, error=FileFormatError):
+    """Tell what a file is from its first bytes.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    error : type, optional
+        Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
+
+    Returns
+    -------
+    kind : str
+        ``"fits"`` (compressed as a whole or not), ``"asdf"`` or ``"text"``.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, unreadable or empty, or is not what its name says.
+    """
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            start = file.read(81)
+    except OSError as problem:
+        reason = problem.strerror or type(problem).__name__
+        raise error(f"{path}: must be a readable file: {reason}") from problem
+    if not start:
+        raise error(f"{path}: must not be empty, the file has 0 bytes")
+    kind = next((k for magic, k in _MAGIC if start.startswith(magic)), "text")
+    if kind in _OPENERS:
+        try:
+            with _OPENERS[kind](path, "rb") as file:
+                start = file.read(9)
+        except READ_ERRORS as problem:
+            raise error(f"{path}: damaged {kind} file: {first_line(problem)}") from problem
+        kind = "fits" if start == b"SIMPLE  =" else "text"
+    if kind == "fits" and (start[80:] in (b"\n", b"\r") or _HEADER_NAME.search(path.name)):
+        # A header alone, as text: cards in lines, or without line ends under a name that says so.
+        kind = "text"
+    if kind != "fits" and _FITS_NAME.search(path.name):
+        shown = start[:9].decode("latin-1")
+        raise error(f"{path}: a FITS file must begin with 'SIMPLE  =', got {shown!r}")
+    return kind
+
+
+@contextlib.contextmanager
+def open_fits(path, *, error=FileFormatError):
+    """Open a FITS file after making sure that all of it is there.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS file, plain, tile-compressed, or compressed as a whole (gzip, bzip2, xz).
+    error : type, optional
+        Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised for any damage.
+
+    Yields
+    ------
+    hdus : `~astropy.io.fits.HDUList`
+        Read without a memory map; closed at the end of the block, within which no warning of any
+        kind is shown.
+
+    Notes
+    -----
+    astropy opens a truncated file and warns; here it is an error, also when it is the data that are
+    cut short.  What astropy has to say about odd headers is of no concern to users of a
+    calibration; so do not warn of one's own inside the block.
+    """
+    path = Path(path)
+    check_complete(path, error=error)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            hdus = fits.open(path, memmap=False, lazy_load_hdus=False)
+        except READ_ERRORS as problem:
+            raise error(f"{path}: damaged FITS file: {first_line(problem)}") from problem
+        with hdus:
+            yield hdus
+
+
+def check_complete(path, *, error=FileFormatError):
+    """Follow the headers of a FITS file and make sure that the data they announce are there.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS file, compressed as a whole or not.
+    error : type, optional
+        Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
+
+    Raises
+    ------
+    InputError
+        If a header does not end or the data of an HDU end early.  Missing padding after the last
+        data is let pass: files without it are common and lack nothing.
+    """
+    path = Path(path)
+    with open(path, "rb") as file:
+        start = file.read(9)
+    kind = next((k for magic, k in _MAGIC if start.startswith(magic)), None)
+    try:
+        if kind in _OPENERS:
+            with _OPENERS[kind](path, "rb") as file:
+                _walk(file, path, error, size=None)
+                # The trailing checksum of the compressed stream counts too.
+                while file.read(1 << 24):
+                    pass
+        else:
+            with open(path, "rb") as file:
+                _walk(file, path, error, size=path.stat().st_size)
+    except InputError:
+        raise
+    except READ_ERRORS as problem:
+        raise error(f"{path}: damaged FITS file: {first_line(problem)}") from problem
+
+
+def _walk(file, path, error, size):
+    """Go from header to header; `size` is the length of the file where it is known."""
+    number = position = 0
+    while True:
+        header = _read_mandatory(file, path, error, number)
+        if header is None:
+            return
+        position += header.pop("length")
+        bits = abs(header.get("BITPIX", 8))
+        axes = [header.get(f"NAXIS{i + 1}", 0) for i in range(header.get("NAXIS", 0))]
+        if header.get("GROUPS") and axes and axes[0] == 0:
+            axes = axes[1:]
+        count = 1 if axes else 0
+        for n in axes:
+            count *= n
+        data = bits // 8 * header.get("GCOUNT", 1) * (header.get("PCOUNT", 0) + count)
+        there = _skip(file, data, position, size)
+        if there < data:
+            raise error(
+                f"{path}: truncated file: HDU {number} must have {data} bytes of data, has {there}"
+            )
+        padded = -(-data // _BLOCK) * _BLOCK
+        _skip(file, padded - data, position + data, size)
+        position += padded
+        number += 1
+
+
+def _skip(file, length, position, size):
+    """Move on by `length` bytes; return how many of them exist."""
+    if size is not None:
+        file.seek(position + length)
+        return max(0, min(length, size - position))
+    there = 0
+    while there < length and (block := file.read(min(1 << 24, length - there))):
+        there += len(block)
+    return there
+
+
+def _read_mandatory(file, path, error, number):
+    """Read one header; the structural keywords and its length in bytes, `None` at the end."""
+    wanted = re.compile(rb"(BITPIX|NAXIS\d*|PCOUNT|GCOUNT|GROUPS) *= *([-+\d]+|T)")
+    found = {"length": 0}
+    while True:
+        block = file.read(_BLOCK)
+        if found["length"] == 0 and block[:8] not in (b"SIMPLE  ", b"XTENSION"):
+            # The end, or what the standard calls special records and tells readers to skip.
+            return None
+        if len(block) < _BLOCK and b"END" not in block:
+            raise error(f"{path}: truncated file: the header of HDU {number} does not end")
+        found["length"] += _BLOCK
+        for i in range(0, len(block), 80):
+            card = block[i : i + 80]
+            if card[:8] == b"END     ":
+                return found
+            if match := wanted.match(card):
+                value = match[2]
+                found[match[1].decode()] = True if value == b"T" else int(value)
+
+
+def check_output(path, *, overwrite):
+    """Make sure that a file may be written, before any work is done for it.
+
+    Parameters
+    ----------
+    path : path-like
+        File to be written.
+    overwrite : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    OutputExistsError
+        If the file exists and may not be replaced.
+    InputError
+        If the folder does not exist or cannot be written to.
+    """
+    path = Path(path)
+    if path.exists() and not overwrite:
+        raise OutputExistsError(f"{path}: file exists and is kept; overwriting must be asked for")
+    if path.is_dir():
+        raise InputError(f"{path}: output must be a file, this is a folder")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: output folder must exist, found no {path.parent}")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError(f"{path}: output folder must be writable, {path.parent} is not")
+
+
+@contextlib.contextmanager
+def atomic_path(path, *, overwrite=False):
+    """Write a file in one step: the block writes a temporary file, which then gets the name.
+
+    Parameters
+    ----------
+    path : path-like
+        File to be written.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Yields
+    ------
+    temporary : `~pathlib.Path`
+        Name to write to, in the same folder.  It is flushed to disk and renamed when the block
+        ends well, and removed when anything is raised, `KeyboardInterrupt` included.
+
+    Raises
+    ------
+    OutputExistsError
+        If the file exists and may not be replaced, also when it appeared in the meantime.
+    InputError
+        If the file cannot be written.
+    """
+    path = Path(path)
+    check_output(path, overwrite=overwrite)
+    # The ending stays, since writers choose their format by it.
+    temporary = path.parent / f".{path.stem[:64]}.{uuid.uuid4().hex}.part{path.suffix}"
+    try:
+        yield temporary
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        if overwrite:
+            os.replace(temporary, path)
+        else:
+            try:
+                # Unlike a rename, a link never replaces what someone else wrote in the meantime.
+                os.link(temporary, path)
+            except FileExistsError:
+                raise OutputExistsError(
+                    f"{path}: file exists and is kept; overwriting must be asked for"
+                ) from None
+            except OSError:
+                # File systems without hard links.
+                os.rename(temporary, path)
+    except InputError:
+        raise
+    except OSError as problem:
+        reason = problem.strerror or first_line(problem)
+        raise InputError(f"{path}: cannot be written: {reason}") from problem
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(temporary)

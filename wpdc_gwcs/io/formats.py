@@ -1,0 +1,177 @@
+"""One way in and one way out for calibrations and solutions, whatever the format."""
+
+from pathlib import Path
+
+from astropy.io import fits
+from astropy.table import Table
+
+from wpdc_gwcs.exceptions import FileFormatError
+from wpdc_gwcs.io.files import file_kind, split_extension
+from wpdc_gwcs.io.headers import parse_tan, parse_wcs, read_headers
+
+__all__ = ["FORMATS", "read", "read_wcs", "write"]
+
+#: Formats of `write`.
+FORMATS = ("asdf", "fits", "cpdis", "head", "sip", "stock")
+_SUFFIXES = {".asdf": "asdf", ".fits": "fits", ".fit": "fits", ".head": "head", ".ecsv": "ecsv"}
+
+
+def read(path):
+    """Read a calibration or a distortion solution.
+
+    Parameters
+    ----------
+    path : path-like
+        ASDF file of this package; FITS file (or ``path[EXT]``), ``.head`` or other text file with a
+        TPV, TAN + PV or TAN header, with the look-up table of this package where there is one.
+
+    Returns
+    -------
+    obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
+        With the fast, exactly invertible ``wcs``.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, empty, damaged, of a newer format version, or something else.
+
+    See Also
+    --------
+    read_wcs : The WCS of any file that has one.
+
+    Examples
+    --------
+    >>> import wpdc_gwcs
+    >>> calibration = wpdc_gwcs.read("a.wcs.asdf")  # doctest: +SKIP
+    >>> ra, dec = calibration.wcs(1023.5, 1023.5)  # doctest: +SKIP
+    """
+    plain, extension = split_extension(path)
+    if file_kind(plain) == "asdf":
+        from wpdc_gwcs.io.asdf import read_asdf
+
+        if extension is not None:
+            raise FileFormatError(f"{path}: only FITS and text files have extensions")
+        return read_asdf(plain)
+    from wpdc_gwcs.io.fits import read_fits
+
+    return read_fits(path)
+
+
+def read_wcs(source):
+    """Read the WCS of a file or header, of whatever kind.
+
+    Parameters
+    ----------
+    source : path-like or `~astropy.io.fits.Header`
+        FITS file or ``path[EXT]``, ``.head`` or other text header, ASDF file with a ``wcs``; or a
+        header.
+
+    Returns
+    -------
+    wcs : `~gwcs.wcs.WCS` or `~astropy.wcs.WCS`
+        For TAN, TPV and TAN + PV an exact gwcs with the numbers of the header (no change of
+        celestial frame); for ASDF the stored one; for SIP and the rest an `astropy.wcs.WCS` in
+        ICRS.
+
+    Raises
+    ------
+    FileFormatError
+        If there is no usable celestial WCS.
+
+    Examples
+    --------
+    >>> from astropy.io import fits
+    >>> from wpdc_gwcs.io import read_wcs
+    >>> header = fits.Header(dict(CTYPE1="RA---TAN", CTYPE2="DEC--TAN", CRPIX1=1.0, CRPIX2=1.0,
+    ...                           CD1_1=-1e-4, CD1_2=0.0, CD2_1=0.0, CD2_2=1e-4, CRVAL1=10.0,
+    CRVAL2=0.0)) >>> ra, dec = read_wcs(header)(0.0, 100.0) >>> round(float(ra), 6),
+    round(float(dec), 6) (10.0, 0.01)
+    """
+    if isinstance(source, fits.Header):
+        return _wcs_of(source, "header", None)
+    plain, _ = split_extension(source)
+    if file_kind(plain) == "asdf":
+        from wpdc_gwcs.io.asdf import read_asdf_wcs
+
+        return read_asdf_wcs(plain)
+    headers = read_headers(source)
+    if len(headers) > 1:
+        raise FileFormatError(f"{source}: has {len(headers)} WCS headers; choose one with path[N]")
+    return _wcs_of(headers[0], str(source), plain)
+
+
+def _wcs_of(header, name, path):
+    tan = parse_tan(header, name=name)
+    if tan is not None:
+        from wpdc_gwcs.wcs import build_wcs
+
+        return build_wcs(
+            crpix=tan.crpix, cd=tan.cd, crval=tan.crval, pv=tan.pv, image_shape=tan.image_shape
+        )
+    if path is not None and file_kind(path) == "fits":
+        from wpdc_gwcs.io.files import open_fits
+
+        with open_fits(path) as hdus:
+            return parse_wcs(header, hdus=hdus, name=name)
+    return parse_wcs(header, name=name)
+
+
+def write(obj, path, *, format=None, overwrite=False):
+    """Write a calibration, a solution or a table, in one step: the whole file or none.
+
+    Parameters
+    ----------
+    obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or `~astropy.table.Table`
+        What to write; in FITS formats, a solution stands about its nominal pointing.
+    path : path-like
+        File to write.
+    format : {"asdf", "fits", "cpdis", "head", "sip", "stock"}, optional
+        By default what the ending says: ``.asdf``, ``.fits``, ``.head``; ``.ecsv`` for tables.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Returns
+    -------
+    deviation : float or None
+        For ``cpdis``, ``head``, ``sip`` and ``stock``: greatest deviation from the exact WCS over
+        the detector, px (for ``head`` it is that of leaving out the look-up table).  `None` for the
+        exact formats.
+
+    Raises
+    ------
+    OutputExistsError
+        If the file exists and may not be replaced.
+    InputError
+        If the file cannot be written.
+    ValueError
+        If the format is unknown.
+
+    Examples
+    --------
+    >>> import wpdc_gwcs
+    >>> calibration = wpdc_gwcs.read("a.wcs.asdf")  # doctest: +SKIP
+    >>> wpdc_gwcs.write(calibration, "a.head")  # doctest: +SKIP
+    """
+    path = Path(path)
+    if format is None:
+        format = _SUFFIXES.get(path.suffix.lower())
+    if isinstance(obj, Table):
+        from wpdc_gwcs.io.tables import write_table
+
+        if format not in ("ecsv", None):
+            raise ValueError(f"a table is written as 'ecsv', got the format {format!r}")
+        return write_table(obj, path, overwrite=overwrite)
+    if format not in FORMATS:
+        raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {format!r} for {path}")
+    return _writer(format)(obj, path, overwrite=overwrite)
+
+
+def _writer(format):
+    # asdf and gwcs take half a second to import: only where they are needed.
+    if format in ("asdf", "stock"):
+        from wpdc_gwcs.io import asdf
+
+        return {"asdf": asdf.write_asdf, "stock": asdf.write_stock}[format]
+    from wpdc_gwcs.io import fits as formats
+
+    return getattr(formats, f"write_{format}")

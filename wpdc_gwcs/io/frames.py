@@ -1,0 +1,593 @@
+"""Frames from files: images, FITS_LDAC source lists, source tables.
+
+::
+
+    image.fits[.fz|.gz], image.fits[EXT] --+
+    list.cat (FITS_LDAC)                 --+--read_frames--> one Frame per detector
+    table.ecsv + WCS header              --+
+
+Headers are read at once and checked; pixels and source lists when they are needed.
+"""
+
+import functools
+import re
+import warnings
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+
+from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
+from wpdc_gwcs.frame import Frame
+from wpdc_gwcs.io.files import (
+    READ_ERRORS,
+    file_kind,
+    first_line,
+    open_fits,
+    split_extension,
+    stem_of,
+)
+from wpdc_gwcs.io.headers import (
+    clean_header,
+    extension_names,
+    find_extension,
+    header_epoch,
+    header_shape,
+    header_text,
+    parse_wcs,
+    positive_number,
+    read_headers,
+)
+
+__all__ = ["read_frames", "standardize_sources"]
+
+_DETECTOR_KEYS = (
+    "DETECTOR",
+    "DETNAME",
+    "CCDNAME",
+    "CHIPNAME",
+    "EXTNAME",
+    "CHIPID",
+    "CCDNUM",
+    "CCDCHIP",
+    "CCDID",
+    "IMAGEID",
+)
+_GAIN_KEYS = ("GAIN", "EGAIN", "GAINA", "CCDGAIN", "ATODGAIN")
+_SATURATION_KEYS = ("SATURATE", "SATURATION", "SATURAT", "SATLEVEL", "SATURATA")
+_FACTS = {"filter": ("FILTER", "FILTER1", "BAND"), "object": ("OBJECT",), "date": ("DATE-OBS",)}
+# Extensions that go with an image and are none, though they carry its WCS.
+_COMPANIONS = re.compile(
+    r"(ERR(OR)?|DQ|WHT|WEIGHT|W(EIGHT)?MAP|MASK|BPM|VAR(IANCE)?|RMS|IVAR|INVVAR|UNC(ERT)?|FLAGS?"
+    r"|CON|CTX|D2IMARR|WCSDVARR|BACKGROUND|BKG|OOD)",
+    re.IGNORECASE,
+)
+_NOT_NAMES = ("PRIMARY", "COMPRESSED_IMAGE", "")
+
+
+def read_frames(path, *, wcs=None, detector=None, name=None, image_shape=None):
+    """Read the frames of a file.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS image (plain, tile-compressed, gzipped; one frame for each image extension with a
+        celestial WCS), ``path[EXT]`` with the number or name of an extension, FITS_LDAC source list
+        (one frame for each of its detectors), or a table of sources, which needs ``wcs``.
+    wcs : path-like or `~astropy.io.fits.Header`, optional
+        Header to use instead of the frame's own: FITS file, ``path[EXT]``, ``.head`` or other text
+        file; of several headers, one for each frame.
+    detector : str, optional
+        Name of the detector instead of the header's.
+    name : str, optional
+        Name of the frame instead of the file's.
+    image_shape : (int, int), optional
+        Shape ``(ny, nx)`` of the detector, where a source list or table does not tell.
+
+    Returns
+    -------
+    frames : list of `~wpdc_gwcs.frame.Frame`
+        At least one.  Pixels and sources are read when their loaders are called.
+
+    Raises
+    ------
+    FrameError
+        If the file is missing, empty, damaged, truncated, not what its name says, or without a
+        celestial WCS.
+
+    Warns
+    -----
+    WPDCWarning
+        If a date makes no sense, or a shape has to be guessed.
+
+    Notes
+    -----
+    A frame is called like its file without endings; of several frames in a file, each has the name
+    or the number of its extension appended.  The detector is that of ``DETECTOR``, ``DETNAME``,
+    ``CCDNAME``, ``EXTNAME``, ... in this order; frames of one file are never one detector.
+    """
+    path, extension = split_extension(path)
+    stem = stem_of(path) if name is None else str(name)
+    if file_kind(path, error=FrameError) != "fits":
+        return [_read_text_table(path, wcs, detector, stem, image_shape)]
+    headers = None if wcs is None else _given_headers(wcs)
+    with open_fits(path, error=FrameError) as hdus:
+        chosen = _choose(hdus, path, extension)
+        if headers is not None and len(headers) not in (1, len(chosen)):
+            raise FrameError(
+                f"{wcs}: must have one WCS header for each of the {len(chosen)} frames of {path}, "
+                f"has {len(headers)}"
+            )
+        if headers is not None and len(headers) == 1 < len(chosen):
+            raise FrameError(
+                f"{path}: has {len(chosen)} frames, one WCS header cannot be that of all"
+            )
+        prepared = [
+            _prepare(hdus, path, kind, index, None if headers is None else headers[i])
+            for i, (kind, index) in enumerate(chosen)
+        ]
+        several = len(_choose(hdus, path, None, quiet=True)) > 1
+    frames = []
+    for part in prepared:
+        label = part["label"] if several else ""
+        frames.append(_frame_of(part, path, stem, label, detector, image_shape))
+    return _distinct(frames, prepared)
+
+
+def _given_headers(wcs):
+    if isinstance(wcs, fits.Header):
+        return [wcs]
+    try:
+        return read_headers(wcs)
+    except FrameError:
+        raise
+    except InputError as problem:
+        raise FrameError(str(problem)) from problem
+
+
+def _choose(hdus, path, extension, *, quiet=False):
+    """Which HDUs are frames: list of (kind, index)."""
+    lists = [i for i, hdu in enumerate(hdus) if hdu.name == "LDAC_OBJECTS"]
+    images = [
+        i for i, hdu in enumerate(hdus) if hdu.is_image and _image_shape(hdu.header) is not None
+    ]
+    tables = [i for i, h in enumerate(hdus) if isinstance(h, fits.BinTableHDU | fits.TableHDU)]
+    tables = [i for i in tables if i not in images]
+    if extension is not None:
+        index = find_extension(hdus, extension, path, error=FrameError)
+        if index in lists or index + 1 in lists:
+            return [("list", index if index in lists else index + 1)]
+        if index in images:
+            return [("image", index)]
+        if index in tables:
+            return [("table", index)]
+        raise FrameError(
+            f"{path}[{extension}]: must be an image, a source list or a table, "
+            f"is {type(hdus[index]).__name__} without data"
+        )
+    if lists:
+        return [("list", i) for i in lists]
+    main = [i for i in images if not _COMPANIONS.fullmatch(hdus[i].name)]
+    images = main or images
+    if len(images) > 1:
+        # Of several images, those without a WCS are something else (guiders, focus chips).
+        images = [i for i in images if "CTYPE1" in hdus[i].header] or images[:1]
+    if images:
+        return [("image", i) for i in images]
+    sources = [i for i in tables if _position_columns(hdus[i].columns.names) is not None]
+    if sources:
+        return [("table", sources[0])]
+    if quiet:
+        return []
+    raise FrameError(
+        f"{path}: must have an image, FITS_LDAC sources or a table with positions, "
+        f"has {extension_names(hdus)}"
+    )
+
+
+def _image_shape(header):
+    """Shape of a two-dimensional image (further axes of length one allowed), else `None`."""
+    n = header.get("NAXIS", 0)
+    axes = [header.get(f"NAXIS{i + 1}", 0) for i in range(n)]
+    if n < 2 or min(axes[:2]) < 1 or any(a != 1 for a in axes[2:]):
+        return None
+    return axes[1], axes[0]
+
+
+def _prepare(hdus, path, kind, index, given):
+    """Everything that needs the open file: headers, WCS, names of columns."""
+    hdu = hdus[index]
+    where = f"{path}[{index}]" if len(hdus) > 1 else str(path)
+    header = hdu.header
+    if kind == "list":
+        header = _ldac_header(hdus, index, where)
+    # Keywords of the whole file stand in the primary header.
+    headers = [header.copy()] + ([hdus[0].header.copy()] if index > 0 else [])
+    if kind != "image":
+        names = hdu.columns.names
+        if _position_columns(names) is None:
+            raise FrameError(
+                f"{where}: source list must have positions (x, y; XWIN_IMAGE, YWIN_IMAGE; X_IMAGE, "
+                f"Y_IMAGE; ...), has {', '.join(names[:12])}"
+            )
+    wcs_header = given
+    if wcs_header is None:
+        wcs_header = header
+        if kind == "table" and "CTYPE1" not in header:
+            wcs_header = next((h for h in headers if "CTYPE1" in h), None)
+            if wcs_header is None:
+                raise FrameError(f"{where}: a table of sources needs a WCS header (--wcs)")
+        elif "CTYPE1" not in header:
+            raise FrameError(f"{where}: header must have a celestial WCS, has no CTYPE1")
+    label = header_text(header, "EXTNAME")
+    if label.upper() in _NOT_NAMES or label == "LDAC_OBJECTS":
+        label = str(index)
+    elif hdu.is_image and hdu.ver > 1:
+        label += f"_{hdu.ver}"
+    shape = _image_shape(header) if kind == "image" else header_shape(header)
+    if shape is None and given is not None:
+        shape = header_shape(given)
+    return {
+        "kind": kind,
+        "index": index,
+        "where": where,
+        "label": label,
+        "headers": headers,
+        "shape": shape,
+        "wcs": parse_wcs(
+            wcs_header, hdus=hdus if given is None else None, name=where, error=FrameError
+        ),
+    }
+
+
+def _ldac_header(hdus, index, where):
+    """Give the image header that a FITS_LDAC file carries as a table of one string."""
+    if index == 0 or hdus[index - 1].name != "LDAC_IMHEAD":
+        raise FrameError(f"{where}: LDAC_OBJECTS must follow LDAC_IMHEAD")
+    try:
+        text = np.asarray(hdus[index - 1].data).tobytes()
+    except READ_ERRORS as problem:
+        raise FrameError(f"{where}: damaged LDAC_IMHEAD: {first_line(problem)}") from problem
+    # Cards of 80 bytes without line ends.
+    headers = clean_header(b"\n".join(text[i : i + 80] for i in range(0, len(text), 80)))
+    if not headers:
+        raise FrameError(f"{where}: LDAC_IMHEAD must hold a header, is empty")
+    return headers[0]
+
+
+def _frame_of(part, path, stem, label, detector, image_shape):
+    headers, where, index = part["headers"], part["where"], part["index"]
+    loaders = {}
+    if part["kind"] == "image":
+        loaders["load_image"] = functools.partial(_load_image, str(path), index)
+    else:
+        loaders["load_sources"] = functools.partial(_load_fits_sources, str(path), index)
+    shape = image_shape if image_shape is not None and part["kind"] != "image" else part["shape"]
+    if shape is None:
+        shape = _guess_shape(loaders["load_sources"](), where)
+    return Frame(
+        name=f"{stem}_{_file_name(label)}" if label else stem,
+        detector=str(detector) if detector is not None else _detector_of(headers),
+        image_shape=tuple(int(n) for n in shape),
+        wcs=part["wcs"],
+        epoch=header_epoch(headers, name=where),
+        source=where,
+        gain=positive_number(headers, _GAIN_KEYS),
+        saturation=positive_number(headers, _SATURATION_KEYS),
+        meta=_facts(headers),
+        **loaders,
+    )
+
+
+def _detector_of(headers):
+    # The primary header describes the whole camera: it has no say where the frame's own names one.
+    for header in headers:
+        for key in _DETECTOR_KEYS:
+            text = header_text(header, key)
+            if text.upper() not in (*_NOT_NAMES, "LDAC_OBJECTS", "LDAC_IMHEAD"):
+                return text
+    return "detector"
+
+
+def _facts(headers):
+    facts = {}
+    for fact, keys in _FACTS.items():
+        text = next((t for h in headers for k in keys if (t := header_text(h, k))), "")
+        if text:
+            facts[fact] = text
+    exposure = positive_number(headers, ("EXPTIME", "EXPOSURE"))
+    return facts if exposure is None else facts | {"exptime": exposure}
+
+
+def _distinct(frames, parts):
+    """Make names of frames and detectors of one file differ."""
+    from dataclasses import replace
+
+    if len(frames) < 2:
+        return frames
+    if len({f.name for f in frames}) < len(frames):
+        frames = [
+            replace(f, name=f"{f.name}_{p['index']}") for f, p in zip(frames, parts, strict=True)
+        ]
+    if len({f.detector for f in frames}) < len(frames):
+        frames = [
+            replace(f, detector=f"{f.detector}_{p['label']}")
+            for f, p in zip(frames, parts, strict=True)
+        ]
+    if len({f.detector for f in frames}) < len(frames):
+        frames = [
+            replace(f, detector=f"{f.detector}_{p['index']}")
+            for f, p in zip(frames, parts, strict=True)
+        ]
+    return frames
+
+
+def _file_name(text):
+    return re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_") or "image"
+
+
+def _load_image(path, index):
+    """Read the pixels of one HDU: float, native byte order, blank pixels NaN."""
+    where = f"{path}[{index}]"
+    with open_fits(path, error=FrameError) as hdus:
+        hdu = hdus[index]
+        # Taken first: astropy drops them from the header when it scales.
+        blank = hdu.header.get("BLANK", hdu.header.get("ZBLANK"))
+        scale, zero = hdu.header.get("BSCALE", 1.0), hdu.header.get("BZERO", 0.0)
+        try:
+            data = hdu.data
+        except READ_ERRORS as problem:
+            raise FrameError(f"{where}: damaged image: {first_line(problem)}") from problem
+        data = data.reshape(data.shape[-2:])
+        if data.dtype.kind in "iub":
+            image = data.astype(np.float32 if data.dtype.itemsize <= 2 else np.float64)
+            if blank is not None:
+                image[data == blank * scale + zero] = np.nan
+            return image
+        return data.astype(np.float64 if data.dtype.itemsize == 8 else np.float32)
+
+
+def _load_fits_sources(path, index):
+    where = f"{path}[{index}]"
+    with open_fits(path, error=FrameError) as hdus:
+        try:
+            columns = hdus[index].columns
+            data = hdus[index].data
+            needed = {c: np.array(data[c]) for c in columns.names if c.lower() in _WANTED}
+            for column in columns:
+                if column.name in needed and column.null is not None:
+                    values = needed[column.name]
+                    needed[column.name] = np.where(values == int(column.null), np.nan, values)
+        except READ_ERRORS as problem:
+            raise FrameError(f"{where}: damaged source list: {first_line(problem)}") from problem
+    return standardize_sources(needed, name=where)
+
+
+def _read_text_table(path, wcs, detector, stem, image_shape):
+    """Read a table of sources in any text format of astropy."""
+    if wcs is None:
+        raise FrameError(f"{path}: a table of sources needs a WCS header (--wcs)")
+    headers = _given_headers(wcs)
+    if len(headers) != 1:
+        raise FrameError(
+            f"{wcs}: must have one WCS header, has {len(headers)}; choose with path[N]"
+        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            suffix = path.suffix.lower()
+            form = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv"}.get(suffix, "ascii")
+            table = Table.read(path, format=form)
+    except READ_ERRORS as problem:
+        raise FrameError(
+            f"{path}: neither FITS nor a readable table of sources: {first_line(problem)}"
+        ) from problem
+    if _position_columns(table.colnames) is None:
+        raise FrameError(
+            f"{path}: table of sources must have columns 'x' and 'y' (zero based; or X_IMAGE, "
+            f"Y_IMAGE), has {', '.join(table.colnames[:12])}"
+        )
+    sources = standardize_sources(table, name=str(path))
+    header = headers[0]
+    shape = image_shape if image_shape is not None else header_shape(header)
+    if shape is None:
+        shape = table.meta.get("image_shape") or _guess_shape(sources, path)
+    meta = fits.Header()
+    for key, value in table.meta.items():
+        if isinstance(value, str | int | float) and re.fullmatch(r"[A-Za-z0-9_-]{1,8}", str(key)):
+            meta[str(key)] = value
+    epoch = table.meta.get("epoch")
+    if not (isinstance(epoch, int | float) and 1800 <= epoch <= 2200):
+        epoch = header_epoch([meta, header], name=str(path))
+    return Frame(
+        name=stem,
+        detector=str(detector) if detector is not None else _detector_of([meta, header]),
+        image_shape=tuple(int(n) for n in shape),
+        wcs=parse_wcs(header, name=str(wcs), error=FrameError),
+        epoch=epoch,
+        source=str(path),
+        load_sources=sources.copy,
+        meta=_facts([meta, header]),
+    )
+
+
+def _guess_shape(sources, where):
+    x, y = (np.asarray(sources[c]) for c in ("x", "y"))
+    if not (np.isfinite(x).any() and np.isfinite(y).any()):
+        raise FrameError(
+            f"{where}: shape of the detector must be given (NAXIS1, NAXIS2), is unknown"
+        )
+    shape = tuple(int(np.ceil(np.nanmax(v) + 0.5)) for v in (y, x))
+    warnings.warn(
+        f"{where}: the header does not tell the shape of the detector; {shape[1]} x {shape[0]} px, "
+        "the reach of the sources, is taken for it",
+        WPDCWarning,
+    )
+    return shape
+
+
+# Families of position columns, best first: x, y, first pixel, errors.  SExtractor counts from one.
+_FAMILIES = (
+    ("x", "y", 0),
+    ("x_centroid", "y_centroid", 0),
+    ("xcentroid", "ycentroid", 0),
+    ("x_fit", "y_fit", 0),
+    ("xpsf_image", "ypsf_image", 1),
+    ("xwin_image", "ywin_image", 1),
+    ("xmodel_image", "ymodel_image", 1),
+    ("x_image", "y_image", 1),
+)
+_TAGS = {"xpsf_image": "psf", "xwin_image": "win", "xmodel_image": "model", "x_image": ""}
+_PLAIN_ERRORS = (("x_err", "y_err"), ("x_error", "y_error"), ("xerr", "yerr"))
+_FLUXES = (
+    "flux",
+    "flux_psf",
+    "flux_auto",
+    "flux_fit",
+    "flux_model",
+    "flux_best",
+    "flux_iso",
+    "flux_aper",
+)
+_MAGNITUDES = ("mag_psf", "mag_auto", "mag_best", "mag_iso", "mag_aper", "mag")
+_WANTED = {
+    *(c for family in _FAMILIES for c in family[:2]),
+    *(c for pair in _PLAIN_ERRORS for c in pair),
+    *(
+        f"{kind}{tag}_image"
+        for tag in ("psf", "win", "model", "")
+        for kind in ("erra", "errb", "errtheta", "errx2", "erry2")
+    ),
+    *_FLUXES,
+    *(f.replace("flux", "fluxerr") for f in _FLUXES),
+    *_MAGNITUDES,
+    *("snr_win", "snr", "roundness", "flags", "flags_win", "imaflags_iso", "elongation"),
+    *("sharpness", "fwhm", "fwhm_image", "flux_radius", "peak", "flux_max"),
+}
+
+
+def _position_columns(names):
+    """Best family of position columns that is there: x, y as spelled, first pixel; or `None`."""
+    spelled = {n.lower(): n for n in reversed(names)}
+    for x, y, origin in _FAMILIES:
+        if x in spelled and y in spelled:
+            # A PSF fit without errors did not converge on much (SExtractor leaves them out then).
+            if x == "xpsf_image" and "errapsf_image" not in spelled:
+                continue
+            return spelled[x], spelled[y], origin
+    if "xpsf_image" in spelled and "ypsf_image" in spelled:
+        return spelled["xpsf_image"], spelled["ypsf_image"], 1
+    return None
+
+
+def standardize_sources(table, *, name="sources"):
+    """Bring a source list to the columns of this package.
+
+    Parameters
+    ----------
+    table : mapping
+        Table or dictionary of columns, with this package's, photutils' or SExtractor's names.
+    name : str, optional
+        What messages call it.
+
+    Returns
+    -------
+    sources : `~astropy.table.Table`
+        ``x``, ``y`` (zero based) and, as far as they are there, ``x_err``, ``y_err``, ``flux``,
+        ``snr``, ``roundness``, ``flags``, ``sharpness``, ``fwhm``, ``peak``, ``mag``; the rows of
+        the input.
+
+    Raises
+    ------
+    FrameError
+        If there are no positions or a column is not numeric.
+
+    Notes
+    -----
+    Errors of SExtractor are ellipses (``ERRAWIN_IMAGE``, ...); taken is their extent along x and y.
+    ``ELONGATION`` e becomes a roundness 2 (e - 1) / (e + 1), which is DAOFIND's for a source
+    elongated along an axis.  Of SExtractor's ``FLAGS``, the lowest bit (a neighbour in the
+    aperture) says nothing of the centroid and is dropped.
+    """
+    names = list(getattr(table, "colnames", table))
+    found = _position_columns(names)
+    if found is None:
+        raise FrameError(f"{name}: source list must have positions, has {', '.join(names[:12])}")
+    x, y, origin = found
+    spelled = {n.lower(): n for n in reversed(names)}
+
+    def column(*aliases):
+        for alias in aliases:
+            if alias in spelled:
+                return _floats(table[spelled[alias]], spelled[alias], name)
+        return None
+
+    out = {"x": _floats(table[x], x, name) - origin, "y": _floats(table[y], y, name) - origin}
+    tag = _TAGS.get(x.lower())
+    errors = _ellipse(column, tag) if tag is not None else None
+    if errors is None:
+        errors = next(
+            ((column(a), column(b)) for a, b in _PLAIN_ERRORS if a in spelled and b in spelled),
+            None,
+        )
+    if errors is not None:
+        # An error of zero is SExtractor's word for none.
+        out["x_err"], out["y_err"] = (np.where(e > 0, e, np.nan) for e in errors)
+    fluxes = _FLUXES if tag == "psf" else tuple(f for f in _FLUXES if f != "flux_psf")
+    flux_name = next((f for f in fluxes if f in spelled), None)
+    if flux_name is not None:
+        out["flux"] = column(flux_name)
+    else:
+        magnitude = column(*_MAGNITUDES)
+        if magnitude is not None:
+            # 99 stands for no magnitude.
+            faint = np.where(np.abs(magnitude) < 90.0, magnitude, np.nan)
+            out["flux"] = 10.0 ** (-0.4 * (faint - 25.0))
+    out["snr"] = column("snr", "snr_win")
+    if out["snr"] is None and flux_name is not None:
+        error = column(flux_name.replace("flux", "fluxerr"))
+        if error is not None:
+            out["snr"] = out["flux"] / np.where(error > 0, error, np.nan)
+    out["roundness"] = column("roundness")
+    if out["roundness"] is None and (elongation := column("elongation")) is not None:
+        out["roundness"] = 2.0 * (elongation - 1.0) / (elongation + 1.0)
+    out["sharpness"] = column("sharpness")
+    out["fwhm"] = column("fwhm", "fwhm_image")
+    if out["fwhm"] is None and (radius := column("flux_radius")) is not None:
+        out["fwhm"] = 2.0 * radius
+    out["peak"] = column("peak", "flux_max")
+    flags = column("flags")
+    if flags is not None:
+        flags = np.nan_to_num(flags).astype(np.int64)
+        out["flags"] = flags if tag is None else flags & ~1
+    return Table({c: v for c, v in out.items() if v is not None})
+
+
+def _ellipse(column, tag):
+    """Errors along x and y from an error ellipse or from variances."""
+    a, b = column(f"erra{tag}_image"), column(f"errb{tag}_image")
+    if a is not None and b is not None:
+        theta = column(f"errtheta{tag}_image")
+        theta = np.zeros_like(a) if theta is None else np.radians(theta)
+        c2, s2 = np.cos(theta) ** 2, np.sin(theta) ** 2
+        return np.sqrt(a**2 * c2 + b**2 * s2), np.sqrt(a**2 * s2 + b**2 * c2)
+    x2, y2 = column(f"errx2{tag}_image"), column(f"erry2{tag}_image")
+    if x2 is not None and y2 is not None:
+        return np.sqrt(np.maximum(x2, 0.0)), np.sqrt(np.maximum(y2, 0.0))
+    return None
+
+
+def _floats(column, label, name):
+    """Plain float64 of one column; masked is NaN, of several apertures the first."""
+    mask = getattr(column, "mask", None)
+    column = getattr(column, "unmasked", column)
+    values = np.ma.getdata(getattr(column, "value", column))
+    try:
+        values = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise FrameError(
+            f"{name}: column {label!r} must be numeric, got {str(values.ravel()[0])!r}"
+        ) from None
+    if mask is not None:
+        values[np.broadcast_to(mask, values.shape)] = np.nan
+    return values if values.ndim == 1 else values.reshape(len(values), -1)[:, 0]

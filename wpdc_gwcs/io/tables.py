@@ -1,0 +1,139 @@
+"""Tables of matches, sources and frames as ECSV, written in one step and fast."""
+
+import csv
+import io
+import warnings
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+
+from wpdc_gwcs.exceptions import FileFormatError
+from wpdc_gwcs.io.files import READ_ERRORS, atomic_path, file_kind, first_line
+
+__all__ = ["read_matches", "read_table", "write_table"]
+
+_FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv"}
+
+
+def write_table(table, path, *, overwrite=False):
+    """Write a table of matches, sources or frames as ECSV.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        Columns of numbers and strings.
+    path : path-like
+        File to write.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    OutputExistsError
+        If the file exists and may not be replaced.
+    InputError
+        If the file cannot be written.
+
+    Notes
+    -----
+    The header is astropy's own; the rows are written here, ten times faster, every float with the
+    digits that bring it back exactly.
+    """
+    plain = Table(table, copy=False)
+    if (
+        any(getattr(column, "ndim", 0) != 1 for column in plain.itercols())
+        or plain.has_masked_values
+    ):
+        text = _text_of(plain)
+    else:
+        # One row of header is what names the columns in ECSV.
+        text = _text_of(plain[:0]) + _rows_of(plain)
+    with atomic_path(path, overwrite=overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def read_table(path, *, columns=()):
+    """Read a table that `write_table` wrote, or any other that astropy reads.
+
+    Parameters
+    ----------
+    path : path-like
+        File in ECSV, CSV, FITS, ...; the format is told by name and content.
+    columns : sequence of str, optional
+        Columns that must be there and be numeric or boolean.
+
+    Returns
+    -------
+    table : `~astropy.table.Table`
+        The table.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, empty or damaged, or lacks a column.
+    """
+    path = Path(path)
+    kind = file_kind(path)
+    form = _FORMATS.get(path.suffix.lower())
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            table = Table.read(path, format="fits" if kind == "fits" else form)
+    except READ_ERRORS as problem:
+        raise FileFormatError(f"{path}: not a readable table: {first_line(problem)}") from problem
+    for column in columns:
+        if column not in table.colnames:
+            raise FileFormatError(
+                f"{path}: table must have a column {column!r}, has {', '.join(table.colnames[:12])}"
+            )
+        if table[column].dtype.kind not in "biuf":
+            raise FileFormatError(
+                f"{path}: column {column!r} must be numeric, is {table[column].dtype}"
+            )
+    return table
+
+
+def read_matches(path):
+    """Read the match table of a frame.
+
+    Parameters
+    ----------
+    path : path-like
+        ``<stem>.matches.ecsv``.
+
+    Returns
+    -------
+    matches : `~astropy.table.Table`
+        The table, with at least the columns ``x``, ``y``, ``dx``, ``dy``, ``used`` and ``holdout``.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, empty or damaged, or lacks a column.
+    """
+    return read_table(path, columns=("x", "y", "dx", "dy", "used", "holdout"))
+
+
+def _text_of(table):
+    buffer = io.StringIO()
+    table.write(buffer, format="ascii.ecsv")
+    return buffer.getvalue()
+
+
+def _rows_of(table):
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, delimiter=" ", lineterminator="\n")
+    writer.writerows(zip(*(_cells(column) for column in table.itercols()), strict=True))
+    return buffer.getvalue()
+
+
+def _cells(column):
+    values = np.asarray(column)
+    if values.dtype.kind == "f":
+        # repr is the shortest text that reads back to the same float64; narrower types have their
+        # own.
+        return values.tolist() if values.dtype.itemsize == 8 else values.astype(str).tolist()
+    if values.dtype.kind == "b":
+        return values.astype(str).tolist()
+    return values.tolist()
