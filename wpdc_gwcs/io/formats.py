@@ -58,7 +58,7 @@ def read(path):
 
 
 def read_wcs(source):
-    """Read the WCS of a file or header, of whatever kind.
+    r"""Read the WCS of a file or header, of whatever kind.
 
     Parameters
     ----------
@@ -82,10 +82,12 @@ def read_wcs(source):
     --------
     >>> from astropy.io import fits
     >>> from wpdc_gwcs.io import read_wcs
-    >>> header = fits.Header(dict(CTYPE1="RA---TAN", CTYPE2="DEC--TAN", CRPIX1=1.0, CRPIX2=1.0,
-    ...                           CD1_1=-1e-4, CD1_2=0.0, CD2_1=0.0, CD2_2=1e-4, CRVAL1=10.0,
-    CRVAL2=0.0)) >>> ra, dec = read_wcs(header)(0.0, 100.0) >>> round(float(ra), 6),
-    round(float(dec), 6) (10.0, 0.01)
+    >>> cards = ["CTYPE1  = 'RA---TAN'", "CTYPE2  = 'DEC--TAN'", "CRVAL1  = 10.0", "CRVAL2  = 0.0",
+    ...          "CRPIX1  = 1.0", "CRPIX2  = 1.0", "CD1_1   = -1e-4", "CD2_2   = 1e-4"]
+    >>> header = fits.Header.fromstring("\n".join(cards), sep="\n")
+    >>> ra, dec = read_wcs(header)(0.0, 100.0)
+    >>> round(float(ra), 6), round(float(dec), 6)
+    (10.0, 0.01)
     """
     if isinstance(source, fits.Header):
         return _wcs_of(source, "header", None)

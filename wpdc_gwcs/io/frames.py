@@ -122,11 +122,17 @@ def read_frames(path, *, wcs=None, detector=None, name=None, image_shape=None):
             raise FrameError(
                 f"{path}: has {len(chosen)} frames, one WCS header cannot be that of all"
             )
+        several = len(_choose(hdus, path, None, quiet=True)) > 1
         prepared = [
-            _prepare(hdus, path, kind, index, None if headers is None else headers[i])
+            _prepare(
+                hdus,
+                f"{path}[{index}]" if several or extension is not None else str(path),
+                kind,
+                index,
+                None if headers is None else headers[i],
+            )
             for i, (kind, index) in enumerate(chosen)
         ]
-        several = len(_choose(hdus, path, None, quiet=True)) > 1
     frames = []
     for part in prepared:
         label = part["label"] if several else ""
@@ -194,10 +200,9 @@ def _image_shape(header):
     return axes[1], axes[0]
 
 
-def _prepare(hdus, path, kind, index, given):
+def _prepare(hdus, where, kind, index, given):
     """Everything that needs the open file: headers, WCS, names of columns."""
     hdu = hdus[index]
-    where = f"{path}[{index}]" if len(hdus) > 1 else str(path)
     header = hdu.header
     if kind == "list":
         header = _ldac_header(hdus, index, where)

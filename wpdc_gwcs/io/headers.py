@@ -609,12 +609,21 @@ def _copy_frame(header, wcs):
 
 def _parse_other(header, hdus, name, error):
     """SIP, other projections, look-up tables: what astropy makes of it."""
+    if "SIP" in header_text(header, "CTYPE1"):
+        # SIP wins over what SCAMP left beside it.
+        header = header.copy()
+        for key in [k for k in header if _PV_CARD.fullmatch(k)]:
+            del header[key]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             wcs = WCS(header, fobj=hdus, naxis=2)
             wcs.wcs.set()
-    except (WcsError, *READ_ERRORS) as problem:
+    except WcsError as problem:
+        # wcslib says last what it is, after the places in its own code.
+        reason = str(problem).strip().split("\n")[-1]
+        raise error(f"{name}: not a usable WCS: {reason}") from problem
+    except READ_ERRORS as problem:
         raise error(f"{name}: not a usable WCS: {first_line(problem)}") from problem
     if not wcs.has_celestial:
         raise error(f"{name}: WCS must be celestial, got {list(wcs.wcs.ctype)}")
