@@ -30,6 +30,7 @@ import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
+from astropy.io.registry import IORegistryError
 from astropy.table import Column, Table
 
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
@@ -116,6 +117,7 @@ _READ_ERRORS = (
     AttributeError,
     ImportError,
     ExpatError,
+    IORegistryError,
 )
 
 
@@ -345,12 +347,17 @@ def _format_of(path, format):
         (".csv", "ascii.csv"),
         (".vot", "votable"),
         (".parquet", "parquet"),
+        (".xml", None),
+        (".h5", None),
+        (".hdf5", None),
+        (".html", None),
+        (".asdf", None),
     ):
         if ending in suffixes:
             return name
     if re.search(r"\.(fits?|fts|fz)(\.gz)?$", path.name.lower()):
         raise CatalogError(f"{path}: a FITS file must begin with 'SIMPLE  =', this one does not")
-    return None
+    return "ascii"
 
 
 def _read_fits_table(path, extension):

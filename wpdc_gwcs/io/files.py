@@ -12,6 +12,7 @@ import zlib
 from pathlib import Path
 
 from astropy.io import fits
+from astropy.io.registry import IORegistryError
 
 from wpdc_gwcs.catalogs import split_extension
 from wpdc_gwcs.exceptions import FileFormatError, InputError
@@ -41,6 +42,7 @@ READ_ERRORS = (
     lzma.LZMAError,
     zlib.error,
     fits.VerifyError,
+    IORegistryError,
 )
 _BLOCK = 2880
 _OPENERS = {"gzip": gzip.open, "bzip2": bz2.open, "xz": lzma.open}

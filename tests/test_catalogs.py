@@ -1,0 +1,469 @@
+"""Reference catalogues: names, units, epochs, and motion against astropy."""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.table import MaskedColumn, QTable, Table
+from astropy.time import Time
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wpdc_gwcs.catalogs import propagate, read_catalog, select_cone
+from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
+
+
+def stars(n=20, seed=0):
+    rng = np.random.default_rng(seed)
+    return Table(
+        {
+            "source_id": np.arange(n) + 10**17,
+            "ra": rng.uniform(0, 360, n) * u.deg,
+            "dec": rng.uniform(-80, 80, n) * u.deg,
+            "pmra": rng.normal(0, 50, n) * u.mas / u.yr,
+            "pmdec": rng.normal(0, 50, n) * u.mas / u.yr,
+            "parallax": rng.uniform(0.1, 100, n) * u.mas,
+            "ref_epoch": np.full(n, 2016.0) * u.yr,
+            "phot_g_mean_mag": rng.uniform(10, 20, n) * u.mag,
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    ("suffix", "format"),
+    [("fits", None), ("ecsv", None), ("csv", None), ("vot", "votable"), ("fits.gz", None)],
+)
+def test_file_formats(tmp_path, suffix, format):
+    table = stars()
+    path = tmp_path / f"ref.{suffix}"
+    # Without units, as CSV has none; the defaults are the same.
+    Table({c: np.asarray(table[c]) for c in table.colnames}).write(path, format=format)
+    catalog = read_catalog(path)
+    for name in table.colnames:
+        np.testing.assert_allclose(catalog[name], np.asarray(table[name]), rtol=1e-14)
+    assert catalog["ra"].dtype == float
+    assert list(catalog["catalog_index"]) == list(range(len(table)))
+
+
+@pytest.mark.parametrize(
+    ("ra", "dec"),
+    [
+        ("RA", "DEC"),
+        ("RA_ICRS", "DE_ICRS"),
+        ("ALPHA_J2000", "DELTA_J2000"),
+        ("X_WORLD", "Y_WORLD"),
+        ("RAJ2000", "DEJ2000"),
+        ("ra_deg", "dec_deg"),
+    ],
+)
+def test_names_of_positions(ra, dec):
+    catalog = read_catalog(Table({ra: [10.0], dec: [-20.0]}))
+    assert (catalog["ra"][0], catalog["dec"][0]) == (10.0, -20.0)
+    assert "ref_epoch" not in catalog.colnames
+
+
+def test_exact_name_before_capitals():
+    catalog = read_catalog(Table({"RA": [1.0], "ra": [2.0], "dec": [3.0]}))
+    assert catalog["ra"][0] == 2.0
+
+
+def test_units_are_converted():
+    table = QTable(
+        {
+            "ra": [1.0] * u.hourangle,
+            "dec": [0.1] * u.rad,
+            "pmra": [1.0] * u.arcsec / u.yr,
+            "pmdec": [1.0] * u.deg / u.Myr,
+            "parallax": [0.1] * u.arcsec,
+            "ra_error": [1e-6] * u.deg,
+            "ref_epoch": [2015.5] * u.yr,
+        }
+    )
+    catalog = read_catalog(table)
+    assert catalog["ra"][0] == pytest.approx(15.0)
+    assert catalog["dec"][0] == pytest.approx(np.degrees(0.1))
+    assert catalog["pmra"][0] == pytest.approx(1000.0)
+    assert catalog["pmdec"][0] == pytest.approx(3.6)
+    assert catalog["parallax"][0] == pytest.approx(100.0)
+    assert catalog["ra_error"][0] == pytest.approx(3.6)
+    assert catalog["ra"].unit == u.deg
+    assert isinstance(table["ra"], u.Quantity)  # the argument is left alone
+
+
+def test_rows_without_position_are_dropped_and_masked_is_nan():
+    table = Table(
+        {
+            "ra": [10.0, np.nan, 12.0, np.inf],
+            "dec": MaskedColumn([0.0, 0.0, 1.0, 0.0], mask=[False, False, False, False]),
+            "pmra": MaskedColumn([1.0, 2.0, 3.0, 4.0], mask=[True, False, False, False]),
+            "pmdec": [1.0, 2.0, np.inf, 4.0],
+            "ref_epoch": [2016.0] * 4,
+        }
+    )
+    catalog = read_catalog(table)
+    assert list(catalog["catalog_index"]) == [0, 2]
+    assert np.isnan(catalog["pmra"][0])
+    assert np.isnan(catalog["pmdec"][1])
+    # Reading what was read keeps the rows of the first input.
+    again = read_catalog(catalog[1:])
+    assert list(again["catalog_index"]) == [2]
+
+
+def test_right_ascension_is_wrapped():
+    assert read_catalog(Table({"ra": [-1.0, 360.0], "dec": [0.0, 0.0]}))["ra"].tolist() == [359, 0]
+
+
+def test_skycoord():
+    coordinates = SkyCoord(
+        [1.0, 2.0] * u.deg,
+        [3.0, 4.0] * u.deg,
+        pm_ra_cosdec=[5, 6] * u.mas / u.yr,
+        pm_dec=[7, 8] * u.mas / u.yr,
+        obstime=Time("J2015.5"),
+    )
+    catalog = read_catalog(coordinates)
+    np.testing.assert_allclose(catalog["pmra"], [5, 6])
+    np.testing.assert_allclose(catalog["ref_epoch"], 2015.5)
+    assert len(read_catalog(SkyCoord(1.0, 2.0, unit="deg"))) == 1
+
+
+def ldac_reference(path, epoch=True):
+    header = "SIMPLE  =                    T".ljust(80) + "END".ljust(80)
+    head = fits.BinTableHDU.from_columns(
+        [fits.Column("Field Header Card", "160A", array=np.array([header]))], name="LDAC_IMHEAD"
+    )
+    columns = [
+        fits.Column("X_WORLD", "1D", array=[10.0, 11.0]),
+        fits.Column("Y_WORLD", "1D", array=[-5.0, 5.0]),
+        fits.Column("ERRA_WORLD", "1E", array=[2e-7, 2e-7]),
+        fits.Column("ERRB_WORLD", "1E", array=[1e-7, 1e-7]),
+        fits.Column("ERRTHETA_WORLD", "1E", array=[0.0, 90.0]),
+        fits.Column("MAG", "1E", array=[15.0, 16.0]),
+    ]
+    if epoch:
+        columns.append(fits.Column("OBSDATE", "1D", unit="yr", array=[2015.0, 2015.0]))
+    objects = fits.BinTableHDU.from_columns(columns, name="LDAC_OBJECTS")
+    fits.HDUList([fits.PrimaryHDU(), head, objects]).writeto(path)
+
+
+def test_ldac(tmp_path):
+    ldac_reference(tmp_path / "ref.cat")
+    catalog = read_catalog(tmp_path / "ref.cat")
+    np.testing.assert_allclose(catalog["ra_error"], [0.72, 0.36], rtol=1e-6)
+    np.testing.assert_allclose(catalog["dec_error"], [0.36, 0.72], rtol=1e-6)
+    np.testing.assert_allclose(catalog["ref_epoch"], 2015.0)
+    np.testing.assert_allclose(catalog["phot_g_mean_mag"], [15, 16])
+
+
+def test_extension_of_a_fits_file(tmp_path):
+    path = tmp_path / "two.fits"
+    first = fits.table_to_hdu(Table({"ra": [1.0], "dec": [2.0]}))
+    second = fits.table_to_hdu(Table({"ra": [3.0], "dec": [4.0]}))
+    second.name = "GAIA"
+    fits.HDUList([fits.PrimaryHDU(), first, second]).writeto(path)
+    assert read_catalog(path)["ra"][0] == 1.0
+    assert read_catalog(f"{path}[2]")["ra"][0] == 3.0
+    assert read_catalog(f"{path}[GAIA]")["ra"][0] == 3.0
+    with pytest.raises(CatalogError, match=r"two.fits.*NONE"):
+        read_catalog(f"{path}[NONE]")
+
+
+@pytest.mark.parametrize(
+    ("meta", "description", "epoch"),
+    [
+        ({"EPOCH": "J2000.0"}, "", 2000.0),
+        ({"REF_EPOCH": 1991.25}, "", 1991.25),
+        ({"ID": "I_355_gaiadr3", "description": "Gaia DR3 Part 1"}, "", 2016.0),
+        ({"COMMENT": ["downloaded from gaia_dr2.gaia_source"]}, "", 2015.5),
+        ({}, "Right ascension (ICRS) at Ep=2015.5", 2015.5),
+    ],
+)
+def test_epoch_of_metadata(meta, description, epoch):
+    table = Table({"ra": [1.0], "dec": [2.0], "pmra": [1.0], "pmdec": [1.0]}, meta=meta)
+    table["ra"].description = description
+    assert read_catalog(table)["ref_epoch"][0] == epoch
+
+
+def test_epoch_is_assumed_aloud():
+    table = Table({"ra": [1.0], "dec": [2.0], "pmra": [1.0], "pmdec": [1.0]})
+    with pytest.warns(WPDCWarning, match=r"without a reference epoch: 2016.0"):
+        catalog = read_catalog(table)
+    assert catalog["ref_epoch"][0] == 2016.0
+
+
+@pytest.mark.parametrize(("value", "year"), [(57388.5, 2016.0), (2457389.0, 2016.0)])
+def test_epoch_as_a_julian_date(value, year):
+    table = Table({"ra": [1.0], "dec": [2.0], "epoch": [value]})
+    assert read_catalog(table)["ref_epoch"][0] == pytest.approx(year, abs=0.01)
+
+
+def write_text(path, text):
+    path.write_text(text)
+    return path
+
+
+class TestBadInput:
+    def test_missing(self, tmp_path):
+        with pytest.raises(CatalogError, match=r"no.fits: catalogue must be an existing file"):
+            read_catalog(tmp_path / "no.fits")
+
+    def test_empty(self, tmp_path):
+        with pytest.raises(CatalogError, match="must not be empty, the file has 0 bytes"):
+            read_catalog(write_text(tmp_path / "a.fits", ""))
+
+    def test_text_named_fits(self, tmp_path):
+        with pytest.raises(CatalogError, match="must begin with 'SIMPLE  ='"):
+            read_catalog(write_text(tmp_path / "a.fits", "hello world\n"))
+
+    def test_folder(self, tmp_path):
+        with pytest.raises(CatalogError, match="cannot be read"):
+            read_catalog(tmp_path)
+
+    def test_truncated(self, tmp_path):
+        stars(500).write(tmp_path / "a.fits")
+        data = (tmp_path / "a.fits").read_bytes()
+        (tmp_path / "b.fits").write_bytes(data[: len(data) // 2])
+        with pytest.raises(CatalogError, match=r"b.fits"):
+            read_catalog(tmp_path / "b.fits")
+
+    def test_garbage(self, tmp_path):
+        (tmp_path / "a.dat").write_bytes(bytes(range(256)) * 20)
+        with pytest.raises(CatalogError, match=r"a.dat"):
+            read_catalog(tmp_path / "a.dat")
+
+    def test_image(self, tmp_path):
+        fits.writeto(tmp_path / "a.fits", np.zeros((3, 3)))
+        with pytest.raises(CatalogError, match="must have a table extension"):
+            read_catalog(tmp_path / "a.fits")
+
+    def test_no_rows(self, tmp_path):
+        stars()[:0].write(tmp_path / "a.fits")
+        with pytest.raises(CatalogError, match=r"a.fits: catalogue must have rows, has 0"):
+            read_catalog(tmp_path / "a.fits")
+
+    def test_no_positions(self):
+        with pytest.raises(CatalogError, match="must have columns 'ra' and 'dec'.*has a, b"):
+            read_catalog(Table({"a": [1.0], "b": [2.0]}))
+
+    def test_all_nan(self):
+        with pytest.raises(CatalogError, match="none of 2 has"):
+            read_catalog(Table({"ra": [np.nan, 1.0], "dec": [1.0, np.nan]}))
+
+    @pytest.mark.parametrize(
+        ("column", "unit"), [("ra", "m"), ("dec", "mag"), ("pmra", "deg"), ("parallax", "s")]
+    )
+    def test_units(self, tmp_path, column, unit):
+        table = stars()
+        table[column].unit = unit
+        table.write(tmp_path / "a.fits")
+        with pytest.raises(CatalogError, match=f"a.fits: unit of column '{column}'.*got '{unit}'"):
+            read_catalog(tmp_path / "a.fits")
+
+    def test_unknown_unit(self, tmp_path):
+        table = fits.BinTableHDU.from_columns(
+            [
+                fits.Column("ra", "1D", unit="furlongs", array=[1.0]),
+                fits.Column("dec", "1D", array=[1.0]),
+            ]
+        )
+        table.writeto(tmp_path / "a.fits")
+        with pytest.raises(CatalogError, match="must be an angle, got 'furlongs'"):
+            read_catalog(tmp_path / "a.fits")
+
+    def test_text_positions(self):
+        with pytest.raises(CatalogError, match="column 'ra' must be numeric, got '12:30:00'"):
+            read_catalog(Table({"ra": ["12:30:00"], "dec": ["+1:00:00"]}))
+
+    def test_declination_out_of_range(self):
+        with pytest.raises(CatalogError, match=r"'dec' must lie in .*got 90.5 in row 1"):
+            read_catalog(Table({"ra": [1.0, 2.0], "dec": [0.0, 90.5]}))
+
+    def test_impossible_epoch(self):
+        with pytest.raises(CatalogError, match="'ref_epoch' must be a Julian year.*got 16"):
+            read_catalog(Table({"ra": [1.0], "dec": [2.0], "ref_epoch": [16.0]}))
+
+    def test_wrong_type(self):
+        with pytest.raises(TypeError, match="must be a path, a Table or a SkyCoord, got int"):
+            read_catalog(3)
+
+
+def truth(table, epoch):
+    """Where astropy puts the stars."""
+    start = SkyCoord(
+        np.asarray(table["ra"]) * u.deg,
+        np.asarray(table["dec"]) * u.deg,
+        pm_ra_cosdec=np.asarray(table["pmra"]) * u.mas / u.yr,
+        pm_dec=np.asarray(table["pmdec"]) * u.mas / u.yr,
+        obstime=Time(2016.0, format="jyear", scale="tcb"),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return start.apply_space_motion(Time(epoch, format="jyear", scale="tcb"))
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(0, 359.999),
+            st.floats(-89.9, 89.9),
+            st.floats(-1e4, 1e4),
+            st.floats(-1e4, 1e4),
+        ),
+        min_size=1,
+        max_size=5,
+    ),
+    st.floats(1950, 2100),
+)
+def test_motion_is_that_of_astropy(rows, epoch):
+    ra, dec, pmra, pmdec = np.array(rows).T
+    table = Table([ra, dec, pmra, pmdec], names=["ra", "dec", "pmra", "pmdec"])
+    table["ref_epoch"] = 2016.0
+    moved = propagate(read_catalog(table), epoch)
+    expected = truth(table, epoch)
+    got = SkyCoord(moved["ra"], moved["dec"], unit="deg")
+    # astropy goes through light times with a tiny parallax; that leaves some 1e-8 of the motion.
+    motion = np.hypot(pmra, pmdec) * abs(epoch - 2016.0) / 1e3
+    assert np.all(got.separation(expected).arcsec < 1e-7 + 1e-6 * motion)
+    scale = 1e-3 + 1e-5 * np.hypot(pmra, pmdec)
+    assert np.all(np.abs(moved["pmra"] - expected.pm_ra_cosdec.to_value("mas/yr")) < scale)
+
+
+def test_motion_over_the_pole_and_back():
+    start = read_catalog(
+        Table(
+            {
+                "ra": [0.0, 359.9999],
+                "dec": [89.9999, 0.0],
+                "pmra": [0.0, 1e5],
+                "pmdec": [1e5, 0.0],
+                "ref_epoch": [2016.0, 2016.0],
+            }
+        )
+    )
+    moved = propagate(start, 2026.0)
+    assert moved["ra"][0] == pytest.approx(180.0)
+    assert moved["ra"][1] == pytest.approx(359.9999 + 1000 / 3600 - 360, abs=1e-5)
+    back = propagate(moved, 2016.0)
+    np.testing.assert_allclose(back["dec"], start["dec"], atol=1e-9)
+    np.testing.assert_allclose((back["ra"] - start["ra"] + 180) % 360, 180, atol=1e-9)
+    assert start["ref_epoch"][0] == 2016.0  # the argument is left alone
+
+
+def test_stars_without_motion_stay_put():
+    table = Table(
+        {
+            "ra": [1.0, 2.0, 3.0],
+            "dec": [0.0, 0.0, 0.0],
+            "pmra": [np.nan, 100.0, 100.0],
+            "pmdec": [1.0, np.nan, 100.0],
+            "ref_epoch": [2000.0] * 3,
+        }
+    )
+    moved = propagate(read_catalog(table), Time("J2100"))
+    assert moved["ra"][:2].tolist() == [1.0, 2.0]
+    assert moved["ra"][2] != 3.0
+    plain = read_catalog(Table({"ra": [1.0], "dec": [2.0]}))
+    assert propagate(plain, 2030.0)["ra"][0] == 1.0
+
+
+def test_errors_grow_with_time():
+    table = Table(
+        {
+            "ra": [1.0],
+            "dec": [2.0],
+            "pmra": [1.0],
+            "pmdec": [1.0],
+            "ra_error": [3.0],
+            "dec_error": [1.0],
+            "pmra_error": [0.4],
+            "pmdec_error": [np.nan],
+            "ref_epoch": [2016.0],
+        }
+    )
+    moved = propagate(read_catalog(table), 2026.0)
+    assert moved["ra_error"][0] == pytest.approx(5.0)
+    assert moved["dec_error"][0] == pytest.approx(1.0)
+
+
+def test_annual_parallax_is_that_of_astropy():
+    table = stars()
+    catalog = read_catalog(table)
+    catalog["parallax"][3] = np.nan
+    epoch = 2018.3
+    seen = propagate(catalog, epoch, parallax=True)
+    unseen = propagate(catalog, epoch)
+    time = Time(epoch, format="jyear", scale="tdb")
+    from astropy.coordinates import get_body_barycentric
+
+    earth = get_body_barycentric("earth", time)
+    far = SkyCoord(
+        np.asarray(unseen["ra"]) * u.deg,
+        np.asarray(unseen["dec"]) * u.deg,
+        distance=1000.0 / np.nan_to_num(np.asarray(catalog["parallax"]), nan=1e-9) * u.pc,
+    ).cartesian
+    expected = SkyCoord(far - earth, frame="icrs")
+    got = SkyCoord(seen["ra"], seen["dec"], unit="deg")
+    assert got.separation(expected).max() < 1e-6 * u.arcsec
+    assert seen["ra"][3] == unseen["ra"][3]
+    assert np.abs(seen["ra"] - unseen["ra"]).max() > 1e-6
+
+
+@pytest.mark.parametrize("epoch", [np.nan, np.inf])
+def test_epoch_must_be_finite(epoch):
+    with pytest.raises(ValueError, match="epoch must be a finite Julian year"):
+        propagate(read_catalog(stars()), epoch)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.floats(0, 360), st.floats(-90, 90), st.floats(0, 180))
+def test_cone_is_that_of_astropy(ra, dec, radius):
+    rng = np.random.default_rng(1)
+    catalog = read_catalog(
+        Table(
+            {
+                "ra": rng.uniform(0, 360, 200),
+                "dec": np.degrees(np.arcsin(rng.uniform(-1, 1, 200))),
+            }
+        )
+    )
+    selected = select_cone(catalog, ra, dec, radius)
+    distance = SkyCoord(catalog["ra"], catalog["dec"], unit="deg").separation(
+        SkyCoord(ra, dec, unit="deg")
+    )
+    clear = np.abs(distance.deg - radius) > 1e-9
+    inside = np.isin(np.asarray(catalog["catalog_index"]), np.asarray(selected["catalog_index"]))
+    assert np.array_equal(inside[clear], (distance.deg < radius)[clear])
+
+
+def test_cone_has_its_rim_and_its_bounds():
+    catalog = read_catalog(Table({"ra": [10.0], "dec": [0.0]}))
+    assert len(select_cone(catalog, 10.0, 0.0, 0.0)) == 1
+    for bad in (-1.0, np.nan):
+        with pytest.raises(ValueError, match="radius >= 0"):
+            select_cone(catalog, 10.0, 0.0, bad)
+
+
+def test_gaia_dr2_of_the_wircam_field(shared_data):
+    path = shared_data / "wircam" / "gaia_dr2.fits"
+    catalog = read_catalog(path)
+    assert len(catalog) == 49977
+    assert "phot_g_mean_mag" not in catalog.colnames
+    assert np.isnan(catalog["pmra"]).sum() == 5411
+    assert set(np.asarray(catalog["ref_epoch"])) == {2015.5}
+    raw = fits.getdata(path)
+    np.testing.assert_array_equal(catalog["ra"], raw["ra"])
+    # The positions at the epoch of the frame that the table of matches has been given by others.
+    matched = Table.read(shared_data / "wircam" / "matched_NE_NW.ecsv.gz", format="ascii.ecsv")
+    moved = propagate(catalog, 2011.5945)
+    index = {s: i for i, s in enumerate(np.asarray(catalog["source_id"]))}
+    rows = [index[g] for g in matched["gid"] if g in index]
+    known = [g in index for g in matched["gid"]]
+    assert len(rows) > 1000
+    cosine = np.cos(np.radians(np.asarray(matched["dec"])[known]))
+    offset = (np.asarray(moved["ra"])[rows] - np.asarray(matched["ra"])[known]) * cosine * 3.6e6
+    moving = np.isfinite(np.asarray(catalog["pmra"])[rows])
+    assert np.median(np.abs(offset[moving])) < 20.0
