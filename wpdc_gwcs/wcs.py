@@ -5,15 +5,31 @@
     detector (px) --DistortionCorrection--> undistorted (px) --TangentSky--> icrs (deg)
 """
 
+import os
+
 import numpy as np
 from astropy import coordinates as coord
 from astropy import units as u
+from astropy.modeling.models import (
+    AffineTransformation2D,
+    Const2D,
+    Identity,
+    Mapping,
+    Pix2Sky_TAN,
+    Polynomial1D,
+    Polynomial2D,
+    RotateNative2Celestial,
+    Shift,
+    Tabular2D,
+)
 from gwcs import WCS
 from gwcs import coordinate_frames as cf
 
 from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, TangentSky
+from wpdc_gwcs.models.blocks import BLOCK_SIZE, run_blocks
+from wpdc_gwcs.models.mapping import PlaneMap, fit_polynomial
 
-__all__ = ["DetectorWCS", "build_wcs"]
+__all__ = ["DetectorWCS", "build_wcs", "sky_map", "to_stock_wcs"]
 
 # An answer this far (px) outside the bounding box lies on its rim but for rounding.
 _RIM_PX = 1e-6
@@ -105,12 +121,12 @@ class DetectorWCS(WCS):
         pixel_arrays : tuple of array_like
             Pixel coordinates; those within 1e-6 px outside the rim are put on it.
         """
+        limits = self.bounding_box.bounding_box(order="F")
         snapped = []
-        for value, (low, high) in zip(
-            pixel_arrays, self.bounding_box.bounding_box(order="F"), strict=True
-        ):
-            value = np.where((value < low) & (value >= low - _RIM_PX), low, value)
-            snapped.append(np.where((value > high) & (value <= high + _RIM_PX), high, value)[()])
+        for value, (low, high) in zip(pixel_arrays, limits, strict=True):
+            # NaN stays NaN.
+            near = np.clip(value, low, high)
+            snapped.append(np.where(np.abs(near - value) <= _RIM_PX, near, value)[()])
         return self._mask(snapped, snapped, fill_value)
 
     def _mask(self, pixels, values, fill_value):
@@ -118,13 +134,17 @@ class DetectorWCS(WCS):
         box = self.bounding_box
         if box is None:
             return values
+        limits = box.bounding_box(order="F")
+        pixels = [np.asarray(pixel) for pixel in pixels]
+        if all(
+            pixel.size and pixel.min() >= low and pixel.max() <= high
+            for pixel, (low, high) in zip(pixels, limits, strict=True)
+        ):
+            return values
         outside = False
-        for pixel, (low, high) in zip(pixels, box.bounding_box(order="F"), strict=True):
-            pixel = np.asarray(pixel)
+        for pixel, (low, high) in zip(pixels, limits, strict=True):
             outside = outside | ~((pixel >= low) & (pixel <= high))
-        if np.any(outside):
-            values = tuple(np.where(outside, fill_value, value)[()] for value in values)
-        return values
+        return tuple(np.where(outside, fill_value, value)[()] for value in values)
 
 
 def build_wcs(*, crpix, cd, crval, pv=None, pv_cd=None, lookup_table=None, image_shape=None):
@@ -206,3 +226,233 @@ def _set_shape(wcs, image_shape):
     wcs.pixel_shape = (nx, ny)
     # Last: inserting frames drops it.
     wcs.bounding_box = ((-0.5, nx - 0.5), (-0.5, ny - 0.5))
+
+
+def sky_map(wcs, *, image_shape=None, out=None):
+    """Compute the sky coordinates of every pixel of an image, block by block.
+
+    Parameters
+    ----------
+    wcs : `gwcs.WCS`
+        The WCS, from pixels to two world coordinates.
+    image_shape : (int, int), optional
+        Shape of the image, (ny, nx); that of the WCS by default.
+    out : array_like or path, optional
+        Where to write: an array (or memory map) of the shape (2, ny, nx), a pair of (ny, nx)
+        arrays, or the path of a new ``.npy`` file of the shape (2, ny, nx), which is memory-mapped.
+
+    Returns
+    -------
+    ra, dec : (ny, nx) ndarray
+        Coordinates of the pixel centres in degrees; views of ``out`` where it was given.
+
+    Raises
+    ------
+    ValueError
+        If the shape of the image is not known, or that of ``out`` does not fit.
+    FileExistsError
+        If ``out`` is the path of a file that is there already.
+
+    Notes
+    -----
+    Beside the outputs it needs some megabytes, whatever the size of the image.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.wcs import build_wcs, sky_map
+    >>> wcs = build_wcs(crpix=(2, 1), cd=[[-1e-4, 0], [0, 1e-4]], crval=(10, 20), image_shape=(3,
+    5)) >>> ra, dec = sky_map(wcs) >>> ra.shape, float(ra[1, 2]), float(dec[1, 2]) ((3, 5), 10.0,
+    20.0)
+    """
+    if image_shape is None:
+        image_shape = wcs.array_shape
+        if image_shape is None:
+            raise ValueError("image_shape must be given: the WCS does not know its shape")
+    ny, nx = (int(n) for n in image_shape)
+    if isinstance(out, (str, os.PathLike)):
+        if os.path.exists(out):
+            raise FileExistsError(f"out must be a new file; {os.fspath(out)!r} is there already")
+        out = np.lib.format.open_memmap(out, mode="w+", dtype=np.float64, shape=(2, ny, nx))
+    ra, dec = (np.empty((ny, nx)), np.empty((ny, nx))) if out is None else out
+    for array in (ra, dec):
+        if array.shape != (ny, nx):
+            raise ValueError(f"out must hold two arrays of the shape {(ny, nx)}, not {array.shape}")
+    transform = wcs.forward_transform
+    if isinstance(transform, DetectorToSky):
+        # Without the overhead of a model call for each block.
+        transform = transform.block_function()
+    columns = np.arange(nx, dtype=float)
+
+    def fill(start, stop):
+        n_rows = stop - start
+        x = np.tile(columns, n_rows)
+        y = np.repeat(np.arange(start, stop, dtype=float), nx)
+        for array, values in zip((ra, dec), transform(x, y), strict=True):
+            array[start:stop] = values.reshape(n_rows, nx)
+
+    run_blocks(fill, ny, step=max(1, BLOCK_SIZE // nx), threaded=nx * ny >= 4 * BLOCK_SIZE)
+    return ra, dec
+
+
+def to_stock_wcs(wcs):
+    """Build the same WCS of stock astropy models only.
+
+    Such a WCS can be stored as ASDF and opened where wpdc_gwcs is not installed.
+
+    Parameters
+    ----------
+    wcs : DetectorWCS
+        As returned by `build_wcs`.
+
+    Returns
+    -------
+    stock : `gwcs.WCS`
+        With the same frames, pixel shape and bounding box.
+
+    Raises
+    ------
+    ValueError
+        If the steps of ``wcs`` are not those that `build_wcs` makes.
+
+    Notes
+    -----
+    The PV chain becomes a `~astropy.modeling.models.Polynomial2D` of the pixels for each axis
+    (radial terms: a `~astropy.modeling.models.Polynomial1D` of the radius), the table a
+    `~astropy.modeling.models.Tabular2D` with the same nodes (``splinef2d``, which is the same
+    bicubic spline, or ``linear``), so the two agree to rounding, about 1e-8 px.
+
+    The inverse of the first step is a polynomial followed by a table of what the polynomial leaves;
+    it is stored with the WCS, and it is good to 1e-4 px unless the look-up table is as rough as its
+    nodes.  gwcs itself masks positions outside the range of right ascension and declination of the
+    corners, so near a pole ask for ``stock.invert(ra, dec, with_bounding_box=False)``.
+    """
+    transforms = [step.transform for step in wcs.pipeline[:-1]]
+    if list(map(type, transforms)) != [DistortionCorrection, TangentSky]:
+        raise ValueError(
+            "wcs must consist of the steps DistortionCorrection and TangentSky, not "
+            f"{[type(transform).__name__ for transform in transforms]}"
+        )
+    distortion, sky = transforms
+    stock_distortion = _stock_distortion(distortion)
+    inverse = _stock_inverse(distortion, wcs.array_shape)
+    if inverse is not None:
+        stock_distortion.inverse = inverse
+    stock_distortion.name = "distortion_correction"
+    stock = WCS(_steps(stock_distortion, _stock_sky(sky)))
+    if wcs.pixel_shape is not None:
+        stock.pixel_shape = wcs.pixel_shape
+    if wcs.bounding_box is not None:
+        stock.bounding_box = wcs.bounding_box.bounding_box(order="F")
+    return stock
+
+
+def _polynomial2d(coefficients):
+    """Return a stock polynomial of ``coefficients[p, q]``, of total degree n - 1."""
+    n = len(coefficients)
+    terms = {f"c{p}_{q}": coefficients[p, q] for p in range(n) for q in range(n - p)}
+    return Polynomial2D(n - 1, **terms)
+
+
+def _pair(first, second):
+    """Return a 2-in 2-out model of two 2-in 1-out models."""
+    return Mapping((0, 1, 0, 1)) | first & second
+
+
+def _stock_distortion(distortion):
+    polynomial, radial = distortion.expand()
+    crpix = distortion.crpix.value
+    centred = Shift(-crpix[0]) & Shift(-crpix[1])
+    model = centred | _pair(*map(_polynomial2d, polynomial))
+    if radial is not None:
+        matrix = distortion.cd.value
+        metric = matrix.T @ matrix
+        squared = np.zeros((3, 3))
+        squared[2, 0], squared[1, 1], squared[0, 2] = metric[0, 0], 2 * metric[0, 1], metric[1, 1]
+        radius = _polynomial2d(squared) ** Const2D(0.5)
+        in_radius = (
+            radius | Polynomial1D(len(row) - 1, **{f"c{s}": value for s, value in enumerate(row)})
+            for row in radial
+        )
+        model = model + (centred | _pair(*in_radius))
+    table = distortion.lookup_table
+    if table is None:
+        return model
+    return model - _stock_table(table.x_grid, table.y_grid, (table.dx, table.dy), table.method)
+
+
+def _stock_table(x_grid, y_grid, values, method):
+    return _pair(
+        *(
+            Tabular2D(
+                points=(np.array(x_grid), np.array(y_grid)),
+                lookup_table=np.ascontiguousarray(value.T),
+                method="splinef2d" if method == "cubic" else "linear",
+                # The spline does not extrapolate, and an error at the first point outside helps
+                # nobody.
+                bounds_error=False,
+                fill_value=np.nan,
+            )
+            for value in values
+        )
+    )
+
+
+def _stock_sky(sky):
+    crpix, cd, crval = sky.crpix.value, sky.cd.value, sky.crval.value
+    return (
+        Shift(-crpix[0]) & Shift(-crpix[1])
+        | AffineTransformation2D(cd, translation=[0.0, 0.0])
+        | Pix2Sky_TAN()
+        | RotateNative2Celestial(crval[0], crval[1], 180.0)
+    )
+
+
+# The stock inverse: degree of its polynomial, nodes along each axis it is fitted to, and the
+# numbers of nodes of its table tried in turn until it is as good as asked for (px).
+_INVERSE_DEGREE = 7
+_INVERSE_FIT_NODES = 33
+_INVERSE_TABLE_NODES = (51, 101, 201)
+_INVERSE_ERROR_PX = 5e-5
+
+
+def _stock_inverse(distortion, image_shape):
+    """Return a stock model of the inverse: a polynomial, then a table of what it leaves.
+
+    `None` where there is none: no range to make it for, or an image that is folded over.
+    """
+    plane_map = distortion._plane_map()
+    grid = plane_map.grid
+    if grid is not None:
+        x_range, y_range = (grid.x_low, grid.x_high), (grid.y_low, grid.y_high)
+    elif image_shape is not None:
+        x_range, y_range = (-0.5, image_shape[1] - 0.5), (-0.5, image_shape[0] - 0.5)
+    else:
+        return None
+    x, y = (v.ravel() for v in np.meshgrid(*_axes(x_range, y_range, _INVERSE_FIT_NODES)))
+    images = plane_map(x, y)
+    polynomial, origin = fit_polynomial(images, (x, y), _INVERSE_DEGREE)
+    approximate = PlaneMap(polynomial, origin)
+    leftover = np.abs(np.subtract(approximate(*images), (x, y))).max()
+    margin = 1.0 + 2.0 * leftover
+    wide_x = (x_range[0] - margin, x_range[1] + margin)
+    wide_y = (y_range[0] - margin, y_range[1] + margin)
+    check = [v.ravel() for v in np.meshgrid(*_axes(x_range, y_range, 2 * _INVERSE_FIT_NODES))]
+    model = Shift(-origin[0]) & Shift(-origin[1]) | _pair(*map(_polynomial2d, polynomial))
+    for n_nodes in _INVERSE_TABLE_NODES:
+        x_nodes, y_nodes = _axes(wide_x, wide_y, n_nodes)
+        x, y = (v.ravel() for v in np.meshgrid(x_nodes, y_nodes))
+        # Where the polynomial takes which image to this node, and which pixel has that image.
+        image = approximate.invert(x, y, tolerance=1e-10)
+        pixel = plane_map.invert(*image, tolerance=1e-10, margin=3 * margin)
+        left = np.subtract(pixel, (x, y)).reshape(2, n_nodes, n_nodes)
+        if not np.all(np.isfinite(left)):
+            return None
+        inverse = model | (Identity(2) + _stock_table(x_nodes, y_nodes, left, "cubic"))
+        found = inverse(*plane_map(*check))
+        if np.abs(np.subtract(found, check)).max() <= _INVERSE_ERROR_PX:
+            break
+    return inverse
+
+
+def _axes(x_range, y_range, n):
+    return np.linspace(*x_range, n), np.linspace(*y_range, n)

@@ -12,11 +12,12 @@ import numpy as np
 
 __all__ = ["BLOCK_SIZE", "evaluate_blocks", "run_blocks"]
 
-#: Points per block: a dozen work arrays of this length stay in a core's second-level cache.
-BLOCK_SIZE = 8192
+#: Points per block: the work arrays stay in a core's caches, and a step over them takes long enough
+#: that threads seldom wait for each other's interpreter lock.
+BLOCK_SIZE = 16384
 
 # Below this many points the threads cost more than they bring.
-_THREADED_SIZE = 8 * BLOCK_SIZE
+_THREADED_SIZE = 4 * BLOCK_SIZE
 
 _MAX_THREADS = 4
 

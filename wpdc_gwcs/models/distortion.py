@@ -145,12 +145,7 @@ class DistortionCorrection(Model):
         if cache is not None and cache[1] is cells and np.array_equal(cache[0], numbers):
             return cache[2]
         crpix, cd = numbers[:2], numbers[2:6].reshape(2, 2)
-        polynomial, radial = expand_pv(numbers[6:].reshape(2, -1), pv.degree, pv.radial, cd)
-        to_pixels = np.linalg.inv(cd)
-        polynomial = np.einsum("ij,jpq->ipq", to_pixels, polynomial)
-        polynomial[:, 0, 0] += crpix
-        if radial is not None:
-            radial = to_pixels @ radial
+        polynomial, radial = self._expand(crpix, cd)
         plane_map = PlaneMap(
             polynomial,
             crpix,
@@ -160,6 +155,27 @@ class DistortionCorrection(Model):
         )
         self._cache = (numbers, cells, plane_map)
         return plane_map
+
+    def _expand(self, crpix, cd):
+        polynomial, radial = expand_pv(self._pv.coefficients, self._pv.degree, self._pv.radial, cd)
+        to_pixels = np.linalg.inv(cd)
+        polynomial = np.einsum("ij,jpq->ipq", to_pixels, polynomial)
+        polynomial[:, 0, 0] += crpix
+        return polynomial, (None if radial is None else to_pixels @ radial)
+
+    def expand(self):
+        """Expand the PV chain, without the table, into powers of ``x - crpix``.
+
+        Returns
+        -------
+        polynomial : (2, n, n) ndarray
+            ``polynomial[k, p, q]`` multiplies ``u**p v**q`` in output k, where (u, v) is the pixel
+            minus ``crpix``.
+        radial : (2, m) ndarray or None
+            ``radial[k, s]`` multiplies ``r**s``, r being the length of ``cd @ (u, v)``; `None`
+            without radial terms.
+        """
+        return self._expand(self.crpix.value, self.cd.value)
 
     def evaluate(self, x, y, crpix, cd):
         """Correct the distortion.
@@ -232,7 +248,7 @@ class DistortionInverse(Model):
         plane_map = self.distortion._plane_map()
 
         def invert(x, y):
-            return plane_map.invert(x, y, x, y, tolerance=_TOLERANCE_PX)
+            return plane_map.invert(x, y, tolerance=_TOLERANCE_PX)
 
         return invert
 
@@ -294,10 +310,20 @@ class DetectorToSky(Model):
         ra, dec : ndarray
             Positions in degrees; NaN outside the table.
         """
+        return evaluate_blocks(self.block_function(), x, y)
+
+    def block_function(self):
+        """Return the map as a function of contiguous 1-D float64 arrays, without model overhead.
+
+        Returns
+        -------
+        function : callable
+            ``function(x, y) -> ra, dec``.
+        """
         undistort = self.distortion._plane_map()
         sky = self.sky
         to_sky = sky._block_function(sky.crpix.value, sky.cd.value, sky.crval.value)
-        return evaluate_blocks(lambda a, b: to_sky(*undistort(a, b)), x, y)
+        return lambda x, y: to_sky(*undistort(x, y))
 
     @property
     def inverse(self):

@@ -10,15 +10,22 @@ folded into the table's cells and costs nothing.  Everything here takes and retu
 float64 blocks; models hand over blocks through `wpdc_gwcs.models.blocks`.
 """
 
+import math
+import threading
 from math import comb
 
 import numpy as np
 
 from wpdc_gwcs.models.terms import pv_terms
 
-__all__ = ["CellGrid", "PlaneMap", "expand_pv"]
+__all__ = ["CellGrid", "PlaneMap", "expand_pv", "fit_polynomial"]
 
 _MAX_NEWTON = 25
+
+# The fit that starts the inversion: degree, and points along each axis.  It leaves a few px of a
+# distortion of 200 px, so that Newton's method needs two steps instead of three.
+_START_DEGREE = 4
+_START_NODES = 17
 
 # How far outside the grid (px) an iterate may go.
 _RIM = 1e-6
@@ -74,6 +81,37 @@ def expand_pv(coefficients, degree, radial, matrix):
     return polynomial, (in_radius if in_radius.any() else None)
 
 
+def fit_polynomial(points, values, degree):
+    """Fit a map of the plane by polynomials.
+
+    Parameters
+    ----------
+    points, values : (2, N) array_like
+        Points and their images.
+    degree : int
+        Total degree.
+
+    Returns
+    -------
+    polynomial : (2, degree + 1, degree + 1) ndarray
+        ``polynomial[k, p, q]`` multiplies ``u**p v**q`` in output k, (u, v) being the point minus
+        origin.
+    origin : (float, float)
+        Centre of the points.
+    """
+    origin = tuple(0.5 * (point.min() + point.max()) for point in points)
+    # Scaled for the solution, not for its use: floating-point powers lose nothing.
+    scale = 0.5 * max(np.ptp(point) for point in points)
+    u, v = ((point - centre) / scale for point, centre in zip(points, origin, strict=True))
+    powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p)]
+    matrix = np.stack([u**p * v**q for p, q in powers], axis=1)
+    fit = np.linalg.lstsq(matrix, np.stack(values, axis=1), rcond=None)[0]
+    polynomial = np.zeros((2, degree + 1, degree + 1))
+    for (p, q), pair in zip(powers, fit, strict=True):
+        polynomial[:, p, q] = pair / scale ** (p + q)
+    return polynomial, origin
+
+
 def _horner(coefficients, a, b):
     """Sum of ``coefficients[p, q] a**p b**q`` over ``p + q < n`` by Horner's rule."""
     n = len(coefficients)
@@ -105,6 +143,44 @@ def _derivative(coefficients, axis):
     return coefficients[: n - 1, 1:] * factors
 
 
+def _horner_columns(columns, s, *, derivative=False):
+    """Sum of ``columns[:, p] s**p``, and its derivative by s when asked for."""
+    n = columns.shape[1]
+    total = columns[:, n - 1] * s
+    total += columns[:, n - 2]
+    if not derivative:
+        for p in range(n - 3, -1, -1):
+            total *= s
+            total += columns[:, p]
+        return total
+    slope = columns[:, n - 1].copy()
+    for p in range(n - 3, -1, -1):
+        slope *= s
+        slope += total
+        total *= s
+        total += columns[:, p]
+    return total, slope
+
+
+class _Scratch(threading.local):
+    """Work space that each thread keeps from block to block.
+
+    Arrays of this size would otherwise be mapped and unmapped by the system for every block, which
+    takes longer than filling them.
+    """
+
+    space = np.empty(0)
+
+    def get(self, shape):
+        size = math.prod(shape)
+        if len(self.space) < size:
+            self.space = np.empty(size)
+        return self.space[:size].reshape(shape)
+
+
+_scratch = _Scratch()
+
+
 class CellGrid:
     """Equally spaced cells, each with its own polynomial in local coordinates from 0 to 1.
 
@@ -123,8 +199,15 @@ class CellGrid:
         self.x_step = (self.x_high - self.x_low) / self.nx
         self.y_step = (self.y_high - self.y_low) / self.ny
         n = coefficients.shape[1]
-        # One contiguous row of cells for each coefficient: a row fits the first-level cache.
-        self.rows = np.ascontiguousarray(coefficients.reshape(2, n, n, -1))
+        # The four powers of s of a cell side by side: one take of 32 bytes fetches them all, and
+        # fetching is what the look-up costs.
+        self.rows = np.ascontiguousarray(coefficients.reshape(2, n, n, -1).transpose(0, 2, 3, 1))
+
+    @property
+    def coefficients(self):
+        """The coefficients the grid was made of, ``[k, p, q, j, i]``."""
+        n = self.rows.shape[1]
+        return self.rows.transpose(0, 3, 1, 2).reshape(2, n, n, self.ny, self.nx)
 
     def locate(self, x, y, margin=0.0):
         """Return cell numbers, local coordinates and what is outside by more than the margin.
@@ -160,66 +243,47 @@ class CellGrid:
 
     def evaluate(self, cell, s, t):
         """Return both outputs."""
-        outputs = []
-        part = np.empty_like(s)
-        inner = np.empty_like(s)
         n = self.rows.shape[1]
+        wide_t, total, part = _scratch.get((3, len(s), n))
+        wide_t[:] = np.repeat(t, n).reshape(-1, n)
+        outputs = []
         for rows in self.rows:
-            total = np.empty_like(s)
-            for p in range(n - 1, -1, -1):
-                target = total if p == n - 1 else inner
-                rows[p, n - 1].take(cell, out=target, mode="clip")
-                for q in range(n - 2, -1, -1):
-                    target *= t
-                    rows[p, q].take(cell, out=part, mode="clip")
-                    target += part
-                if target is inner:
-                    total *= s
-                    total += inner
-            outputs.append(total)
+            rows[n - 1].take(cell, axis=0, out=total, mode="clip")
+            for q in range(n - 2, -1, -1):
+                total *= wide_t
+                rows[q].take(cell, axis=0, out=part, mode="clip")
+                total += part
+            outputs.append(_horner_columns(total, s))
         return outputs
 
     def evaluate_jacobian(self, cell, s, t):
         """Return both outputs and their derivatives, ``(a, b), (a_x, a_y, b_x, b_y)``."""
-        outputs, derivatives = [], []
-        part = np.empty_like(s)
         n = self.rows.shape[1]
+        wide_t, total, slope, part = _scratch.get((4, len(s), n))
+        wide_t[:] = np.repeat(t, n).reshape(-1, n)
+        outputs, derivatives = [], []
         for rows in self.rows:
-            total = total_s = total_t = None
-            for p in range(n - 1, -1, -1):
-                inner = rows[p, n - 1].take(cell, mode="clip")
-                inner_t = None
-                for q in range(n - 2, -1, -1):
-                    if inner_t is None:
-                        inner_t = inner.copy()
-                    else:
-                        inner_t *= t
-                        inner_t += inner
-                    inner *= t
-                    rows[p, q].take(cell, out=part, mode="clip")
-                    inner += part
-                if total is None:
-                    total, total_t = inner, inner_t
-                    continue
-                if total_s is None:
-                    total_s = total.copy()
+            rows[n - 1].take(cell, axis=0, out=total, mode="clip")
+            for q in range(n - 2, -1, -1):
+                if q == n - 2:
+                    slope[:] = total
                 else:
-                    total_s *= s
-                    total_s += total
-                total *= s
-                total += inner
-                total_t *= s
-                total_t += inner_t
-            total_s *= 1.0 / self.x_step
-            total_t *= 1.0 / self.y_step
-            outputs.append(total)
-            derivatives += [total_s, total_t]
+                    slope *= wide_t
+                    slope += total
+                total *= wide_t
+                rows[q].take(cell, axis=0, out=part, mode="clip")
+                total += part
+            value, by_s = _horner_columns(total, s, derivative=True)
+            by_t = _horner_columns(slope, s)
+            by_s *= 1.0 / self.x_step
+            by_t *= 1.0 / self.y_step
+            outputs.append(value)
+            derivatives += [by_s, by_t]
         return outputs, derivatives
 
     def negated(self):
         """Return the grid with both outputs negated."""
-        coefficients = -self.rows.reshape(*self.rows.shape[:3], self.ny, self.nx)
-        return CellGrid((self.x_low, self.x_high), (self.y_low, self.y_high), coefficients)
+        return CellGrid((self.x_low, self.x_high), (self.y_low, self.y_high), -self.coefficients)
 
     def fold(self, polynomial, origin):
         """Return a grid of bicubic cells with a polynomial of degree 3 or less added.
@@ -251,7 +315,7 @@ class CellGrid:
         local = np.einsum("iap,jbq,kpq->kabji", *shifts, polynomial, optimize=True)
         n = self.rows.shape[1]
         total = np.zeros((2, 4, 4, self.ny, self.nx))
-        total[:, :n, :n] += self.rows.reshape(2, n, n, self.ny, self.nx)
+        total[:, :n, :n] += self.coefficients
         total[:, :m, :m] += local
         return CellGrid((self.x_low, self.x_high), (self.y_low, self.y_high), total)
 
@@ -285,6 +349,7 @@ class PlaneMap:
         self.radial = radial
         self.radial_matrix = np.eye(2) if radial_matrix is None else radial_matrix
         self.grid = grid
+        self._start_fit = None
         if polynomial is not None:
             self.derivatives = [(_derivative(c, 0), _derivative(c, 1)) for c in polynomial]
 
@@ -373,17 +438,18 @@ class PlaneMap:
                     value[outside] = np.nan
         return values, derivatives
 
-    def invert(self, a, b, x, y, *, tolerance):
+    def invert(self, a, b, *, tolerance, margin=_RIM):
         """Invert a block of points by Newton's method with the analytic Jacobian.
 
         Parameters
         ----------
         a, b : (N,) ndarray
             Images to invert.
-        x, y : (N,) ndarray
-            Where to start.
         tolerance : float
             Greatest residual of the map at the answer, in units of a and b.
+        margin : float, optional
+            How far outside the grid an answer may lie.  Answers within the default margin, which is
+            there for rounding only, are put on the rim.
 
         Returns
         -------
@@ -401,7 +467,8 @@ class PlaneMap:
         x_out, y_out = np.full(a.shape, np.nan), np.full(a.shape, np.nan)
         index = np.flatnonzero(np.isfinite(a) & np.isfinite(b))
         whole = len(index) == len(a)
-        a, b, x, y = (np.array(value if whole else value[index]) for value in (a, b, x, y))
+        a, b = (value if whole else value[index] for value in (a, b))
+        x, y = self._start(a, b)
         self._clip(x, y)
         # Rounding of the map itself sets the floor.
         limit = tolerance + 16 * np.finfo(float).eps * np.maximum(np.abs(a), np.abs(b))
@@ -409,7 +476,7 @@ class PlaneMap:
             for _ in range(_MAX_NEWTON):
                 if not len(index):
                     break
-                (fa, fb), (a_x, a_y, b_x, b_y) = self.jacobian(x, y, _RIM)
+                (fa, fb), (a_x, a_y, b_x, b_y) = self.jacobian(x, y, margin)
                 np.subtract(a, fa, out=fa)
                 np.subtract(b, fb, out=fb)
                 determinant = a_x * b_y
@@ -432,7 +499,7 @@ class PlaneMap:
                 a_x -= b_x
                 a_x /= determinant
                 x_new, y_new = x + b_y, y + a_x
-                self._clip(x_new, y_new, _RIM)
+                self._clip(x_new, y_new, margin)
                 # A point that no longer moves, or left for infinity, has no answer.
                 going = (x_new != x) | (y_new != y)
                 going &= np.isfinite(x_new) & np.isfinite(y_new)
@@ -442,8 +509,26 @@ class PlaneMap:
                 else:
                     a, b, limit, index = (value[going] for value in (a, b, limit, index))
                     x, y = x_new[going], y_new[going]
-        self._clip(x_out, y_out)
+        if margin <= _RIM:
+            self._clip(x_out, y_out)
         return x_out, y_out
+
+    def _start(self, a, b):
+        """Return where to start the inversion: a fit of the inverse, or the images themselves."""
+        if self.grid is None:
+            # No telling where a fit should hold; distortion is small beside the identity.
+            return a.copy(), b.copy()
+        if self._start_fit is None:
+            grid = self.grid
+            x, y = np.meshgrid(
+                np.linspace(grid.x_low, grid.x_high, _START_NODES),
+                np.linspace(grid.y_low, grid.y_high, _START_NODES),
+            )
+            x, y = x.ravel(), y.ravel()
+            self._start_fit = fit_polynomial(self(x, y), (x, y), _START_DEGREE)
+        polynomial, origin = self._start_fit
+        u, v = a - origin[0], b - origin[1]
+        return [_horner(c, u, v) for c in polynomial]
 
     def _clip(self, x, y, margin=0.0):
         if self.grid is not None:

@@ -280,7 +280,7 @@ class PVInverse(Model):
         plane_map = self.polynomial._plane_map(self.polynomial.coefficients)
 
         def invert(a, b):
-            return plane_map.invert(a, b, a, b, tolerance=_TOLERANCE_DEG)
+            return plane_map.invert(a, b, tolerance=_TOLERANCE_DEG)
 
         return evaluate_blocks(invert, xi, eta)
 
