@@ -1,0 +1,248 @@
+"""The core: two lists of plane positions in, one-to-one pairs and their evidence out."""
+
+import time
+
+import numpy as np
+
+from wpdc_gwcs.exceptions import MatchError
+from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
+from wpdc_gwcs.matching._mapping import MAX_ORDER, SmoothMap
+from wpdc_gwcs.matching._search import Limits, Search, Stars
+
+__all__ = ["match_planes"]
+
+# Fewer stars than this in either list cannot give evidence whatever they do.
+MIN_STARS = 8
+
+
+def match_planes(
+    xs,
+    ys,
+    xr,
+    yr,
+    *,
+    image_shape,
+    flux=None,
+    mag=None,
+    x_err=None,
+    y_err=None,
+    start=None,
+    blind=False,
+    max_shift=None,
+    max_rotation=3.0,
+    max_scale=0.03,
+    max_distortion=250.0,
+    max_order=MAX_ORDER,
+    min_significance=9.0,
+    min_purity=0.9,
+):
+    """Find which source is which reference star, from positions in one plane.
+
+    Parameters
+    ----------
+    xs, ys : (N,) array_like
+        Positions of the sources in pixels of the starting WCS, zero based.
+    xr, yr : (M,) array_like
+        Positions of the reference stars in the same pixels: projected about the tangent point of
+        the starting WCS.
+    image_shape : (int, int)
+        Shape of the frame, ``(ny, nx)``.
+    flux : (N,) array_like, optional
+        Brightness of the sources in any linear unit: brighter is larger.
+    mag : (M,) array_like, optional
+        Magnitudes of the reference stars.  With both, bright stars are matched first; without, all
+        at once.
+    x_err, y_err : (N,) array_like, optional
+        Errors of the source positions, px; they set the final radius star by star.
+    start : SmoothMap, optional
+        A mapping to begin with (``mapping`` of earlier diagnostics) in place of the search by
+        patterns.
+    blind : bool
+        Search also mirrored frames, frames turned by 90, 180 and 270 degrees, scales off by up to
+        6 % and
+        pointings off by up to 0.3 of the frame.
+    max_shift : float, optional
+        Largest error of the pointing, px; default 0.15 of the longer side, at least 450 px.
+    max_rotation : float
+        Largest error of the rotation at the centre of the frame, deg.
+    max_scale : float
+        Largest relative error of the scale at the centre of the frame.
+    max_distortion : float
+        Largest displacement by distortion on the frame, px.
+    max_order : int
+        Highest order of the smooth mapping.
+    min_significance : float
+        Significance over chance that the pairs must have, sigma.
+    min_purity : float
+        Least share of right pairs.
+
+    Returns
+    -------
+    i_src, i_ref : (n,) ndarray of int
+        Rows of the pairs in the inputs, in order of the source row.
+    diagnostics : MatchDiagnostics
+        Evidence, mapping and timings.
+
+    Raises
+    ------
+    MatchError
+        If the evidence for a match is missing; the message says which.
+    ValueError
+        If lengths or options are not valid.
+
+    Notes
+    -----
+    The stages are described in `wpdc_gwcs.matching`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.matching import match_planes
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 1000, (2, 200))
+    >>> turned = x + 20 - 0.01 * y, y - 12 + 0.01 * x
+    >>> i, j, diagnostics = match_planes(x[::-1], y[::-1], *turned, image_shape=(1000, 1000))
+    >>> bool((i == 199 - j).all()), len(i), round(diagnostics.rotation, 3)
+    (True, 200, 0.573)
+    """
+    clock = _Clock()
+    ny, nx = (int(n) for n in image_shape)
+    if min(ny, nx) < 1:
+        raise ValueError(f"image_shape must be two positive numbers (ny, nx); got {image_shape}")
+    sources, rows_s, flux, duplicates_s = _prepare("xs", "ys", xs, ys, flux, "flux")
+    reference, rows_r, mag, duplicates_r = _prepare(
+        "xr", "yr", xr, yr, None if mag is None else -np.asarray(mag), "mag"
+    )
+    errors = _combine_errors(x_err, y_err, len(np.atleast_1d(xs)))
+    errors = None if errors is None else errors[rows_s]
+    half_diagonal = 0.5 * np.hypot(nx, ny)
+    if blind:
+        max_shift, max_scale = 0.3 * max(nx, ny), 0.06
+    elif max_shift is None:
+        max_shift = max(450.0, 0.15 * max(nx, ny))
+    limits = Limits(max_shift, max_rotation, max_scale, max_distortion, half_diagonal)
+    frame = SmoothMap.identity((ny, nx))
+    near = np.hypot(*(reference - frame.center).T) < half_diagonal + limits.reach(half_diagonal)
+    reference, rows_r, mag = reference[near], rows_r[near], None if mag is None else mag[near]
+    for name, points in (
+        ("sources", sources),
+        ("reference stars in reach of the frame", reference),
+    ):
+        if len(points) < MIN_STARS:
+            raise MatchError(
+                f"too few {name} to match: {len(points)} with usable positions, "
+                f"{MIN_STARS} are needed"
+            )
+    stars = Stars.build(reference)
+    clock.lap("prepare")
+    search = Search(
+        sources,
+        stars,
+        flux,
+        mag,
+        errors,
+        (ny, nx),
+        frame,
+        limits,
+        max_order,
+        min_significance,
+        min_purity,
+    )
+    found = (
+        search.from_start(start, clock) if start is not None else search.by_patterns(blind, clock)
+    )
+    mapping, evidence, (i, j), n_ambiguous, scatter, radius, parity = found
+    shift, matrix = mapping.linear_part()
+    if parity < 0:
+        matrix = matrix @ np.diag([-1, 1])
+    return (
+        *_in_source_order(rows_s[i], rows_r[j]),
+        MatchDiagnostics(
+            n_sources=evidence.n_sources,
+            n_reference=evidence.n_reference,
+            n_pairs=evidence.n_pairs,
+            expected_by_chance=evidence.expected_by_chance,
+            purity=evidence.purity,
+            completeness=evidence.completeness,
+            significance=evidence.significance,
+            n_ambiguous=n_ambiguous,
+            n_duplicates=duplicates_s + duplicates_r,
+            scatter=scatter,
+            radius=radius,
+            mapping=mapping,
+            shift=(float(shift[0]), float(shift[1])),
+            rotation=float(
+                np.rad2deg(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
+            ),
+            scale=float(np.sqrt(abs(np.linalg.det(matrix)))),
+            parity=parity,
+            areas=evidence.areas,
+            timings=clock.laps,
+        ),
+    )
+
+
+class _Clock:
+    """Seconds by stage; a stage that comes back adds up."""
+
+    def __init__(self):
+        self.laps = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name):
+        now = time.perf_counter()
+        self.laps[name] = self.laps.get(name, 0.0) + now - self._last
+        self._last = now
+
+
+def _prepare(name_x, name_y, x, y, brightness, name_brightness):
+    """Finite, distinct positions with their rows; brightness only if it orders the stars."""
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    if x.ndim != 1 or x.shape != y.shape:
+        raise ValueError(
+            f"{name_x} and {name_y} must be one-dimensional and of equal length; "
+            f"got {x.shape}, {y.shape}"
+        )
+    rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    points = np.column_stack([x[rows], y[rows]])
+    _, first = np.unique(points, axis=0, return_index=True)
+    first.sort()
+    n_duplicates = len(rows) - len(first)
+    points, rows = points[first], rows[first]
+    if brightness is not None:
+        brightness = np.asarray(brightness, float)
+        if brightness.shape != x.shape:
+            raise ValueError(
+                f"{name_brightness} must have one value per star; "
+                f"got {brightness.shape} for {x.shape}"
+            )
+        brightness = brightness[rows]
+        known = np.isfinite(brightness)
+        # ties or gaps in more than half of the values leave no order to speak of
+        if known.sum() < 0.5 * len(rows) or len(np.unique(brightness[known])) < 0.5 * known.sum():
+            brightness = None
+        else:
+            brightness = np.where(known, brightness, -np.inf)
+    return points, rows, brightness, n_duplicates
+
+
+def _combine_errors(x_err, y_err, n):
+    """One error per star, or None."""
+    given = [np.asarray(e, float) for e in (x_err, y_err) if e is not None]
+    for e in given:
+        if e.shape != (n,):
+            raise ValueError(
+                f"x_err and y_err must have one value per source; got {e.shape} for {n} sources"
+            )
+    if not given:
+        return None
+    errors = np.sqrt(np.mean(np.square(given), axis=0))
+    good = np.isfinite(errors) & (errors > 0)
+    if not good.any():
+        return None
+    return np.where(good, errors, np.max(errors[good]))
+
+
+def _in_source_order(i, j):
+    order = np.argsort(i, kind="stable")
+    return i[order], j[order]

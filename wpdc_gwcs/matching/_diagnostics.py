@@ -1,0 +1,83 @@
+"""What a match reports about itself."""
+
+from dataclasses import dataclass, field
+
+from wpdc_gwcs.matching._mapping import SmoothMap
+
+__all__ = ["MatchDiagnostics"]
+
+
+@dataclass(frozen=True, eq=False)
+class MatchDiagnostics:
+    """What was found and how sure it is.
+
+    Parameters
+    ----------
+    n_sources, n_reference : int
+        Usable sources, and usable reference stars that fall on the frame.
+    n_pairs : int
+        Pairs delivered.
+    expected_by_chance : float
+        Pairs that chance alone gives at the final radius, counted at shifted positions.
+    purity : float
+        Estimated share of right pairs among those delivered.
+    completeness : float
+        Pairs per star of the list that has fewer on the frame.
+    significance : float
+        Significance of the pairs over chance, sigma.
+    n_ambiguous : int
+        Sources left out because there were two candidates within the tolerance.
+    n_duplicates : int
+        Rows of either list left out because an earlier row has the same position.
+    scatter : float
+        Robust 1-sigma scatter of the pairs about the smooth mapping per axis, px.
+    radius : float
+        Median pairing radius, px.
+    mapping : SmoothMap
+        The smooth mapping from starting to reference pixels; `match_planes` can start from it.
+    shift : (float, float)
+        Displacement of the centre of the frame, px.
+    rotation, scale : float
+        Rotation in deg and scale of the header at the centre of the frame, from `mapping`.
+    parity : int
+        -1 where the frame was found mirrored, else 1.
+    areas : tuple of AreaEvidence
+        Evidence in the parts of the frame.
+    timings : dict
+        Seconds spent in each stage.
+    """
+
+    n_sources: int
+    n_reference: int
+    n_pairs: int
+    expected_by_chance: float
+    purity: float
+    completeness: float
+    significance: float
+    n_ambiguous: int
+    n_duplicates: int
+    scatter: float
+    radius: float
+    mapping: SmoothMap
+    shift: tuple
+    rotation: float
+    scale: float
+    parity: int
+    areas: tuple
+    timings: dict = field(default_factory=dict)
+
+    def to_dict(self):
+        """Return the plain numbers (no mapping, areas summed up) for tables and files."""
+        judged = [a for a in self.areas if a.judged]
+        plain = {
+            name: getattr(self, name)
+            for name in self.__dataclass_fields__
+            if name not in ("mapping", "areas", "timings", "shift")
+        }
+        plain["shift_x"], plain["shift_y"] = self.shift
+        plain["n_areas"] = len(judged)
+        plain["lowest_area_completeness"] = min(
+            (a.n_pairs / a.expected for a in judged), default=float("nan")
+        )
+        plain["seconds"] = sum(self.timings.values())
+        return plain

@@ -1,0 +1,244 @@
+"""Evidence that a match is real: the pairs against chance, in the frame and in its parts."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaln, pdtr
+
+from wpdc_gwcs.matching._mapping import count_terms
+from wpdc_gwcs.matching._pairs import find_edges, one_to_one
+
+__all__ = ["AreaEvidence", "Evidence", "collect_evidence", "poisson_significance"]
+
+# Sources looked at for the chance level, and shifts tried.
+_SAMPLE = 20_000
+_N_SHIFTS = 12
+# Pairs that an area must lead one to expect before it is judged, and pairs that make it worth
+# splitting.
+_JUDGED = 8.0
+_SPLIT = 48.0
+_MAX_DEPTH = 4
+
+
+@dataclass(frozen=True)
+class AreaEvidence:
+    """Evidence in one rectangle of the frame.
+
+    Parameters
+    ----------
+    x_min, x_max, y_min, y_max : float
+        The rectangle, px.
+    n_sources, n_reference, n_pairs : int
+        Stars of either list in it, and pairs.
+    expected : float
+        Pairs expected if the area were like the rest of the frame.
+    expected_by_chance : float
+        Pairs that chance gives.
+    judged : bool
+        Whether there are enough stars to say anything.
+    accepted : bool
+        Whether the pairs exceed chance and are not far fewer than expected; true where not judged.
+    """
+
+    x_min: float
+    x_max: float
+    y_min: float
+    y_max: float
+    n_sources: int
+    n_reference: int
+    n_pairs: int
+    expected: float
+    expected_by_chance: float
+    judged: bool
+    accepted: bool
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Numbers on which a match is accepted or refused."""
+
+    n_pairs: int
+    n_sources: int
+    n_reference: int
+    expected_by_chance: float
+    purity: float
+    completeness: float
+    significance: float
+    areas: tuple
+
+    def missing(self, *, min_significance, min_purity):
+        """Say what is missing for the match to be accepted; an empty string if nothing is."""
+        if self.significance < min_significance:
+            return (
+                f"{self.n_pairs} pairs with {self.expected_by_chance:.3g} expected by chance "
+                f"have a significance of {self.significance:.1f} sigma, "
+                f"{min_significance:g} are needed"
+            )
+        if self.purity < min_purity:
+            return (
+                f"of {self.n_pairs} pairs {self.expected_by_chance:.3g} are expected by chance: "
+                f"a purity of {self.purity:.3f}, {min_purity:g} is needed"
+            )
+        bad = [a for a in self.areas if not a.accepted]
+        if bad:
+            worst = max(bad, key=lambda a: a.expected - a.n_pairs)
+            return (
+                f"{len(bad)} of {sum(a.judged for a in self.areas)} parts of the frame lack pairs; "
+                f"worst is x {worst.x_min:.0f} to {worst.x_max:.0f}, "
+                f"y {worst.y_min:.0f} to {worst.y_max:.0f} px: {worst.n_pairs} pairs, "
+                f"{worst.expected:.0f} expected, {worst.expected_by_chance:.2g} by chance"
+            )
+        return ""
+
+
+def poisson_significance(count, expected):
+    """Express the chance to see at least `count` where `expected` are expected as sigmas.
+
+    Notes
+    -----
+    Uses sqrt(-2 ln P), with P bounded by the leading terms of the Poisson tail, which holds where
+    P underflows.
+    """
+    if count <= expected:
+        return 0.0
+    log_p = (
+        count * np.log(expected) - expected - gammaln(count + 1) - np.log1p(-expected / (count + 1))
+    )
+    return float(np.sqrt(max(0.0, -2 * log_p)))
+
+
+def collect_evidence(detector, mapped, radius, reference, tree, limit, mapping, pairs, image_shape):
+    """Measure what a set of pairs is worth.
+
+    Parameters
+    ----------
+    detector, mapped : (N, 2) ndarray
+        Starting and mapped positions of the sources, px.
+    radius : (N,) ndarray
+        Pairing radius of each source, px.
+    reference : (M, 2) ndarray
+        Reference positions, px.
+    tree : `~scipy.spatial.cKDTree`
+        Tree of `reference`.
+    limit : (M,) ndarray
+        Largest radius usable at each reference star.
+    mapping : SmoothMap
+        The mapping, which also costs degrees of freedom.
+    pairs : (i_src, i_ref)
+        The pairs.
+    image_shape : (int, int)
+        Shape of the frame.
+
+    Returns
+    -------
+    Evidence
+
+    Notes
+    -----
+    The chance level is counted, not modelled: the mapped sources are shifted against the reference
+    by vectors
+    far longer than the radius (but short against the scale on which the density changes) and
+    paired again.
+    Each term of the mapping can bring one pair into line, so the significance counts the pairs
+    less the terms.
+    """
+    ny, nx = image_shape
+    i_src, i_ref = pairs
+    n_pairs = len(i_src)
+    usable = np.flatnonzero(radius > 0)
+    step = max(1, -(-len(usable) // _SAMPLE))
+    sample = usable[::step]
+    by_chance, hits = _count_by_chance(mapped[sample], radius[sample], tree, limit)
+    by_chance *= len(usable) / max(1, len(sample))
+    hit_weight = len(usable) / max(1, len(sample)) / _N_SHIFTS
+    back_x, back_y = mapping.inverse(reference[:, 0], reference[:, 1])
+    inside = (back_x > -0.5) & (back_x < nx - 0.5) & (back_y > -0.5) & (back_y < ny - 0.5)
+    n_reference = int(np.count_nonzero(inside))
+    n_sources = len(detector)
+    # half a pair in all shifts together where none was seen
+    floor = 0.5 * hit_weight
+    terms = count_terms(mapping.order)
+    unpaired = max(0.0, 1 - n_pairs / max(1, n_sources))
+    purity = 1 - min(1.0, by_chance * unpaired / n_pairs) if n_pairs else 0.0
+    areas = ()
+    if n_pairs:
+        areas = _judge_areas(
+            detector,
+            np.column_stack([back_x, back_y])[inside],
+            detector[i_src],
+            detector[sample[hits]],
+            hit_weight,
+            (n_pairs / n_sources, n_pairs / max(1, n_reference)),
+            (-0.5, nx - 0.5, -0.5, ny - 0.5),
+        )
+    return Evidence(
+        n_pairs=n_pairs,
+        n_sources=n_sources,
+        n_reference=n_reference,
+        expected_by_chance=float(by_chance),
+        purity=float(purity),
+        completeness=float(n_pairs / max(1, min(n_sources, n_reference))),
+        significance=poisson_significance(max(0, n_pairs - terms), max(by_chance, floor)),
+        areas=tuple(areas),
+    )
+
+
+def _count_by_chance(mapped, radius, tree, limit):
+    """Mean number of pairs at shifted positions, and the sources in them, all shifts."""
+    if len(mapped) == 0:
+        return 0.0, np.empty(0, int)
+    base = max(15.0, 6 * float(np.median(radius)))
+    hits = []
+    for k in range(_N_SHIFTS):
+        # golden-angle spiral: directions and lengths without a common period
+        length = base * (1 + 2 * (k + 0.5) / _N_SHIFTS)
+        shift = length * np.array([np.cos(2.39996 * k), np.sin(2.39996 * k)])
+        i, j, _ = find_edges(mapped + shift, tree, radius, limit=limit)
+        keep, _ = one_to_one(i, j, len(mapped), tree.n)
+        hits.append(i[keep])
+    hits = np.concatenate(hits)
+    return len(hits) / _N_SHIFTS, hits
+
+
+def _judge_areas(sources, reference, pairs, chance, weight, shares, box, depth=0):
+    """Evidence of a rectangle or, where there are many stars, of its quarters."""
+    x0, x1, y0, y1 = box
+    expected = min(shares[0] * len(sources), shares[1] * len(reference))
+    if expected >= _SPLIT and depth < _MAX_DEPTH:
+        xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+        areas = []
+        for right in (False, True):
+            for upper in (False, True):
+                part = [
+                    p[((p[:, 0] > xm) == right) & ((p[:, 1] > ym) == upper)]
+                    for p in (sources, reference, pairs, chance)
+                ]
+                quarter = (
+                    xm if right else x0,
+                    x1 if right else xm,
+                    ym if upper else y0,
+                    y1 if upper else ym,
+                )
+                areas += _judge_areas(*part, weight, shares, quarter, depth + 1)
+        return areas
+    by_chance = len(chance) * weight
+    judged = expected >= _JUDGED
+    n = len(pairs)
+    # p < 1e-3 on either side: more than chance, and not absurdly fewer than half of what the
+    # frame's average promises
+    accepted = (not judged) or (
+        poisson_significance(n, max(by_chance, 0.5 * weight)) > 3.7
+        and pdtr(n, 0.4 * expected) > 1e-3
+    )
+    return [
+        AreaEvidence(
+            *(float(v) for v in box),
+            n_sources=len(sources),
+            n_reference=len(reference),
+            n_pairs=n,
+            expected=float(expected),
+            expected_by_chance=float(by_chance),
+            judged=judged,
+            accepted=bool(accepted),
+        )
+    ]

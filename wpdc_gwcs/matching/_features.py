@@ -1,0 +1,339 @@
+"""Neighbour patterns: who is who, from relative positions alone.
+
+Around every star its neighbours are noted as ``(log d, theta)``.  A common rotation and scale of
+the neighbourhood
+is a common shift in that plane, so two stars are compared by looking for the shift at which most
+of their
+neighbours coincide; how many coincide by chance follows from how many differences there are.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import gammainc
+
+__all__ = [
+    "Hypotheses",
+    "compare_patterns",
+    "density_ratio_map",
+    "neighbour_pattern",
+    "select_coherent",
+]
+
+# Widths of the coincidence box in (log d, theta): from fine to coarse, the data pick (adaptive
+# threshold).
+BOX_WIDTHS = (0.02, 0.04, 0.08)
+# Differences held in memory at a time.
+_CHUNK = 6_000_000
+N_NEIGHBOURS = 12
+MAX_NEIGHBOURS = 160
+
+
+def density_ratio_map(xs, ys, xr, yr, image_shape, *, per_cell=40.0):
+    """Local ratio of the source density to the reference density, on a grid over the frame.
+
+    Parameters
+    ----------
+    xs, ys, xr, yr : ndarray
+        Positions of sources and reference stars, px.
+    image_shape : (int, int)
+        Shape of the frame, ``(ny, nx)``.
+    per_cell : float
+        Cells are made large enough for this many stars of the sparser list on average.
+
+    Returns
+    -------
+    ratio : (ny_cells, nx_cells) ndarray
+        Sources per reference star; one star is added to both counts, so that empty cells say 1.
+    x_edges, y_edges : ndarray
+        Edges of the cells, px.
+    """
+    ny, nx = image_shape
+    inside = (xr > -0.5) & (xr < nx - 0.5) & (yr > -0.5) & (yr < ny - 0.5)
+    fewest = max(1, min(len(xs), np.count_nonzero(inside)))
+    n_cells = int(np.clip(np.sqrt(fewest / per_cell), 1, 32))
+    x_edges = np.linspace(-0.5, nx - 0.5, n_cells + 1)
+    y_edges = np.linspace(-0.5, ny - 0.5, n_cells + 1)
+    counts = [np.histogram2d(y, x, bins=(y_edges, x_edges))[0] for x, y in ((xs, ys), (xr, yr))]
+    return (counts[0] + 1) / (counts[1] + 1), x_edges, y_edges
+
+
+def neighbour_pattern(points, tree, rows, n_neighbours, *, workers=2):
+    """Neighbours of some stars in polar form.
+
+    Parameters
+    ----------
+    points : (N, 2) ndarray
+        Positions of all stars of the list, px.
+    tree : `~scipy.spatial.cKDTree`
+        Tree of `points`.
+    rows : (n,) ndarray of int
+        Stars whose neighbours are wanted.
+    n_neighbours : int
+        How many.
+
+    Returns
+    -------
+    log_distance, angle : (n, k) ndarray
+        Natural logarithm of the distance in px and direction in rad; NaN where a list has too few
+        stars.
+    neighbour : (n, k) ndarray of int
+        Row of each neighbour.
+    """
+    k = min(n_neighbours, tree.n - 1)
+    distance, neighbour = tree.query(points[rows], k=k + 1, workers=workers)
+    distance, neighbour = distance[:, 1:], neighbour[:, 1:]
+    step = points[neighbour] - points[rows][:, None, :]
+    with np.errstate(divide="ignore"):
+        log_distance = np.where(distance > 0, np.log(distance), np.nan)
+    return log_distance, np.arctan2(step[..., 1], step[..., 0]), neighbour
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """Candidates "source i is reference star j", with local scale and rotation.
+
+    Parameters
+    ----------
+    source, reference : (n,) ndarray of int
+        Rows in the two lists.
+    log_scale, rotation : (n,) ndarray
+        Reference neighbourhood relative to the source's, rotation in rad.
+    count, expected : (n,) ndarray
+        Neighbours that coincide and how many would by chance.
+    surprise : (n,) ndarray
+        Minus the decimal logarithm of the probability to see so many by chance.
+    width : (n,) ndarray
+        Width of the coincidence box.
+    """
+
+    source: np.ndarray
+    reference: np.ndarray
+    log_scale: np.ndarray
+    rotation: np.ndarray
+    count: np.ndarray
+    expected: np.ndarray
+    surprise: np.ndarray
+    width: np.ndarray
+
+    def __len__(self):
+        return len(self.source)
+
+    def take(self, rows):
+        """Return some rows as a new object."""
+        return Hypotheses(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+
+def compare_patterns(
+    sources,
+    anchors,
+    tree,
+    *,
+    reach,
+    n_source,
+    n_reference,
+    max_log_scale,
+    max_rotation,
+    per_anchor=4,
+):
+    """Compare the neighbour patterns of some sources with those of all reference stars in reach.
+
+    Parameters
+    ----------
+    sources : (N, 2) ndarray
+        Positions of the sources, px.
+    anchors : (n,) ndarray of int
+        Sources to find.
+    tree : `~scipy.spatial.cKDTree`
+        Tree of the reference stars.
+    reach : (n,) ndarray
+        Largest displacement of each anchor, px.
+    n_source, n_reference : int
+        Neighbours to look at on either side.
+    max_log_scale, max_rotation : float
+        Largest difference of local scale (natural log) and rotation (rad).
+    per_anchor : int
+        Candidates to keep for every source.
+
+    Returns
+    -------
+    Hypotheses
+        The best candidates, most surprising first.
+    """
+    reference = tree.data
+    source_tree = cKDTree(sources)
+    source_log, source_angle, _ = neighbour_pattern(sources, source_tree, anchors, n_source)
+    candidates = tree.query_ball_point(sources[anchors], reach, workers=2, return_sorted=False)
+    sizes = np.array([len(c) for c in candidates])
+    if sizes.sum() == 0:
+        return Hypotheses(*(np.empty(0, int),) * 2, *(np.empty(0),) * 6)
+    wanted = np.concatenate([np.asarray(c, int) for c in candidates])
+    rows, where = np.unique(wanted, return_inverse=True)
+    reference_log, reference_angle, _ = neighbour_pattern(reference, tree, rows, n_reference)
+    anchor_of = np.repeat(np.arange(len(anchors)), sizes)
+    per_pair = source_log.shape[1] * reference_log.shape[1]
+    parts = []
+    chunk = max(1, _CHUNK // max(1, per_pair))
+    source_log, source_angle = source_log.astype(np.float32), source_angle.astype(np.float32)
+    reference_log, reference_angle = (
+        reference_log.astype(np.float32),
+        reference_angle.astype(np.float32),
+    )
+    for start in range(0, len(anchor_of), chunk):
+        part = slice(start, start + chunk)
+        parts.append(
+            _coincidences(
+                source_log[anchor_of[part]],
+                source_angle[anchor_of[part]],
+                reference_log[where[part]],
+                reference_angle[where[part]],
+                max_log_scale,
+                max_rotation,
+            )
+        )
+    log_scale, rotation, count, expected, surprise, width = (
+        np.concatenate(p) for p in zip(*parts, strict=True)
+    )
+    order = np.lexsort((-surprise, anchor_of))
+    first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    rank = np.arange(len(order)) - np.repeat(first, sizes)
+    order = order[(rank < per_anchor) & (surprise[order] > 0)]
+    order = order[np.argsort(-surprise[order], kind="stable")]
+    return Hypotheses(
+        anchors[anchor_of[order]],
+        rows[where[order]],
+        log_scale[order],
+        rotation[order],
+        count[order],
+        expected[order],
+        surprise[order],
+        width[order],
+    )
+
+
+def _coincidences(log_s, angle_s, log_r, angle_r, max_log_scale, max_rotation):
+    """Best common shift in (log d, theta) of patterns (P, ks) against (P, kr)."""
+    n = len(log_s)
+    difference = log_r[:, None, :] - log_s[:, :, None]
+    pair, ks, kr = np.nonzero(np.abs(difference) <= max_log_scale)
+    d_log = difference[pair, ks, kr]
+    d_angle = angle_r[pair, kr] - angle_s[pair, ks]
+    d_angle -= np.float32(2 * np.pi) * np.rint(d_angle / np.float32(2 * np.pi))
+    near = np.abs(d_angle) <= max_rotation
+    pair, d_log, d_angle = pair[near], d_log[near].astype(float), d_angle[near].astype(float)
+    in_range = np.bincount(pair, minlength=n)
+    best = [np.zeros(n) for _ in range(6)]
+    for width in BOX_WIDTHS:
+        if width > 2 * max(max_log_scale, max_rotation):
+            continue
+        n_log = int(2 * max_log_scale / width) + 3
+        n_angle = int(2 * max_rotation / width) + 3
+        share = min(1.0, width**2 / (4 * max_log_scale * max_rotation))
+        for half_log in (0.0, 0.5):
+            for half_angle in (0.0, 0.5):
+                cell = np.floor((d_log + max_log_scale) / width + half_log).astype(int)
+                cell = cell * n_angle + np.floor(
+                    (d_angle + max_rotation) / width + half_angle
+                ).astype(int)
+                key, inverse, count = np.unique(
+                    pair * (n_log * n_angle) + cell, return_inverse=True, return_counts=True
+                )
+                if len(key) == 0:
+                    continue
+                owner = key // (n_log * n_angle)
+                expected = np.maximum((in_range[owner] - count) * share, 1e-3)
+                probability = gammainc(count, expected)
+                surprise = -np.log10(np.maximum(probability, 1e-300))
+                surprise[count < 3] = 0.0
+                order = np.lexsort((-surprise, owner))
+                winner = order[np.concatenate([[True], owner[order][1:] != owner[order][:-1]])]
+                winner = winner[surprise[winner] > best[4][owner[winner]]]
+                where = owner[winner]
+                sums = [
+                    np.bincount(inverse, weights=w, minlength=len(key))[winner]
+                    for w in (d_log, d_angle)
+                ]
+                values = (
+                    sums[0] / count[winner],
+                    sums[1] / count[winner],
+                    count[winner],
+                    expected[winner],
+                )
+                for target, value in zip(best, (*values, surprise[winner], width), strict=True):
+                    target[where] = value
+    return best
+
+
+def select_coherent(hypotheses, sources, reference, *, curvature, density, max_seeds=8, most=500):
+    """Find groups of hypotheses that tell one story.
+
+    Two hypotheses agree when the local scale and rotation of one predict where the other one's
+    star is, within
+    the width of its box and what the curvature of the distortion may add over the distance between
+    them.
+
+    Parameters
+    ----------
+    hypotheses : Hypotheses
+        Candidates, most surprising first.
+    sources, reference : ndarray
+        Positions of the two lists, px.
+    curvature : float
+        Largest second derivative of the distortion, 1/px.
+    density : float
+        Reference stars per square pixel, which says how often two agree by chance.
+    max_seeds : int
+        Groups to return.
+    most : int
+        Hypotheses to look at.
+
+    Returns
+    -------
+    list of (support, rows)
+        For each group the sum of its surprises and its rows in `hypotheses`, best first.
+    """
+    h = hypotheses.take(slice(0, most))
+    if len(h) == 0:
+        return []
+    at, to = sources[h.source], reference[h.reference]
+    step = at[None] - at[:, None]
+    c, s = np.exp(h.log_scale) * np.cos(h.rotation), np.exp(h.log_scale) * np.sin(h.rotation)
+    predicted = to[:, None, :] + np.stack(
+        [
+            c[:, None] * step[..., 0] - s[:, None] * step[..., 1],
+            s[:, None] * step[..., 0] + c[:, None] * step[..., 1],
+        ],
+        axis=-1,
+    )
+    distance = np.hypot(step[..., 0], step[..., 1])
+    error = np.hypot(predicted[..., 0] - to[None, :, 0], predicted[..., 1] - to[None, :, 1])
+    tolerance = 3.0 + 0.5 * h.width[:, None] * distance + 0.5 * curvature * distance**2
+    slack = h.width[:, None] + h.width[None, :] + curvature * distance
+    agree = (
+        (error <= tolerance)
+        & (np.abs(h.log_scale[:, None] - h.log_scale[None]) <= slack)
+        & (np.abs(h.rotation[:, None] - h.rotation[None]) <= slack)
+    )
+    # an agreement is worth what is left of the other's surprise after the number of stars it could
+    # have picked
+    worth = h.surprise[None] - 1.0 - np.log10(1 + density * np.pi * tolerance**2)
+    worth = np.where(agree & (h.source[:, None] != h.source[None]), np.maximum(worth, 0.0), 0.0)
+    np.fill_diagonal(worth, h.surprise)
+    # a source counts once in a group: its best hypothesis there
+    order = np.argsort(h.source, kind="stable")
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(h.source[order]) > 0]))
+    support = np.maximum.reduceat(worth[:, order], starts, axis=1).sum(axis=1)
+    groups, taken = [], np.zeros(len(h), bool)
+    for seed in np.argsort(-support, kind="stable"):
+        if taken[seed]:
+            continue
+        members = np.flatnonzero(worth[seed] > 0)
+        members = members[np.argsort(-worth[seed, members], kind="stable")]
+        _, once = np.unique(h.source[members], return_index=True)
+        members = members[np.sort(once)]
+        taken[members] = True
+        groups.append((float(support[seed]), members))
+        if len(groups) == max_seeds:
+            break
+    return groups

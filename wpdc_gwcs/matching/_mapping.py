@@ -1,0 +1,271 @@
+"""The smooth mapping from starting positions to the reference plane, and its robust fit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+__all__ = ["SmoothMap", "SmoothFit", "count_terms", "fit_smooth_map", "scatter_of"]
+
+MAX_ORDER = 7
+# Pairs that a fit of n terms needs at least: fewer, and leave-one-out errors no longer mean
+# anything.
+PAIRS_PER_TERM = 2.0
+# Below this scatter (px) differences are round-off: it keeps noise-free input from ending in a
+# zero radius.
+SMALLEST_SCATTER = 1e-5
+_BLOCK = 65536
+
+
+def count_terms(order):
+    """Count the terms per axis of a full two-dimensional polynomial."""
+    return (order + 1) * (order + 2) // 2
+
+
+def scatter_of(dx, dy):
+    """Robust 1-sigma scatter per axis from the median length of two-dimensional residuals.
+
+    For Gaussian noise the squared length has its median at ``2 ln 2`` variances.
+    """
+    if len(dx) == 0:
+        return np.nan
+    return float(np.sqrt(np.median(dx**2 + dy**2) / (2 * np.log(2))))
+
+
+def _design(u, v, order):
+    """Products of Chebyshev polynomials by total degree: lower orders are leading columns."""
+    powers = []
+    for w in (u, v):
+        t = [np.ones_like(w), w]
+        for _ in range(2, order + 1):
+            t.append(2 * w * t[-1] - t[-2])
+        powers.append(t)
+    columns = [
+        powers[0][degree - q] * powers[1][q]
+        for degree in range(order + 1)
+        for q in range(degree + 1)
+    ]
+    return np.stack(columns, axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothMap:
+    r"""A polynomial mapping of the plane: starting pixel to reference pixel.
+
+    Parameters
+    ----------
+    order : int
+        Total degree of the polynomial.
+    coefficients : (2, n_terms) ndarray
+        Displacement in x and y, in products of Chebyshev polynomials of the normalised coordinates
+        sorted by
+        total degree.
+    center : (2,) ndarray
+        Where the normalised coordinates are zero, px.
+    scale : float
+        Pixels per normalised unit.
+
+    Notes
+    -----
+    With u = (x - x_c) / s and v = (y - y_c) / s
+
+    .. math:: X = x + \sum_{p+q \le n} a_{pq} T_p(u) T_q(v), \quad Y = y + \sum_{p+q \le n}
+    b_{pq} T_p(u) T_q(v)
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.matching import SmoothMap
+    >>> shift = SmoothMap.identity((100, 200)).shifted(3.0, -1.0)
+    >>> x, y = shift([10.0], [20.0])
+    >>> float(x[0]), float(y[0])
+    (13.0, 19.0)
+    """
+
+    order: int
+    coefficients: np.ndarray
+    center: np.ndarray
+    scale: float
+
+    @classmethod
+    def identity(cls, image_shape):
+        """Make the mapping that moves nothing, normalised to a frame of the shape ``(ny, nx)``."""
+        ny, nx = image_shape
+        return cls(
+            1, np.zeros((2, 3)), np.array([0.5 * (nx - 1), 0.5 * (ny - 1)]), 0.5 * max(nx, ny)
+        )
+
+    def shifted(self, dx, dy):
+        """Return the same mapping with a shift in pixels added."""
+        coefficients = self.coefficients.copy()
+        coefficients[:, 0] += dx, dy
+        return SmoothMap(self.order, coefficients, self.center, self.scale)
+
+    def __call__(self, x, y):
+        """Map positions.
+
+        Parameters
+        ----------
+        x, y : (N,) array_like
+            Starting pixel coordinates, zero based.
+
+        Returns
+        -------
+        x, y : (N,) ndarray
+            Reference pixel coordinates.
+        """
+        x, y = np.asarray(x, float), np.asarray(y, float)
+        out = np.empty((2, x.size))
+        flat_x, flat_y = x.ravel(), y.ravel()
+        for start in range(0, x.size, _BLOCK):
+            part = slice(start, start + _BLOCK)
+            design = _design(*self._normalise(flat_x[part], flat_y[part]), self.order)
+            out[:, part] = self.coefficients @ design.T
+        return x + out[0].reshape(x.shape), y + out[1].reshape(y.shape)
+
+    def linear_part(self):
+        """Shift at the centre of the frame and the matrix of first derivatives there.
+
+        Returns
+        -------
+        shift : (2,) ndarray
+            Displacement of the centre, px.
+        matrix : (2, 2) ndarray
+            Derivatives of the mapped position with respect to the starting position.
+        """
+        step = 1e-3 * self.scale
+        cx, cy = self.center
+        x, y = self(cx + step * np.array([0, 1, -1, 0, 0]), cy + step * np.array([0, 0, 0, 1, -1]))
+        matrix = np.array([[x[1] - x[2], x[3] - x[4]], [y[1] - y[2], y[3] - y[4]]]) / (2 * step)
+        return np.array([x[0] - cx, y[0] - cy]), matrix
+
+    def inverse(self, x, y, *, iterations=12):
+        """Find the starting positions of mapped ones by fixed-point iteration.
+
+        The displacement is evaluated no further than 5 % outside the frame, where a polynomial
+        still means
+        something; good to a fraction of a pixel, which is what counting stars in the frame needs.
+        """
+        x, y = np.asarray(x, float), np.asarray(y, float)
+        cx, cy = self.center
+        reach = 1.05 * self.scale
+        px, py = x.copy(), y.copy()
+        for _ in range(iterations):
+            qx, qy = np.clip(px, cx - reach, cx + reach), np.clip(py, cy - reach, cy + reach)
+            mx, my = self(qx, qy)
+            px, py = x - (mx - qx), y - (my - qy)
+        return px, py
+
+    def _normalise(self, x, y):
+        return (x - self.center[0]) / self.scale, (y - self.center[1]) / self.scale
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothFit:
+    """A fitted `SmoothMap` with what is needed to say how well it predicts.
+
+    Parameters
+    ----------
+    mapping : SmoothMap
+        The mapping.
+    scatter : float
+        Robust scatter per axis of the leave-one-out residuals, px.
+    used : (N,) ndarray of bool
+        Pairs that took part after clipping.
+    triangle : (n_terms, n_terms) ndarray
+        Triangular factor of the design matrix.
+    """
+
+    mapping: SmoothMap
+    scatter: float
+    used: np.ndarray
+    triangle: np.ndarray
+
+    def leverage(self, x, y):
+        """Variance of the prediction at a position in units of the variance of one pair."""
+        x, y = np.asarray(x, float), np.asarray(y, float)
+        out = np.empty(len(x))
+        for start in range(0, len(x), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            design = _design(*self.mapping._normalise(x[part], y[part]), self.mapping.order)
+            out[part] = (
+                solve_triangular(self.triangle, design.T, trans="T", check_finite=False) ** 2
+            ).sum(axis=0)
+        return out
+
+
+def fit_smooth_map(x, y, x_ref, y_ref, *, center, scale, max_order=MAX_ORDER, clip=5.0):
+    """Fit a smooth mapping to pairs: order from leave-one-out errors, outliers clipped.
+
+    All orders come from one QR decomposition, since the columns are sorted by degree.  The order
+    is the lowest
+    one whose mean squared leave-one-out error (each clipped, so that wrong pairs do not decide) is
+    within 2 %
+    of the best.
+
+    Parameters
+    ----------
+    x, y : (N,) ndarray
+        Starting positions, px.
+    x_ref, y_ref : (N,) ndarray
+        Reference positions, px.
+    center, scale
+        Normalisation of the coordinates, see `SmoothMap`.
+    max_order : int
+        Highest order to try.
+    clip : float
+        Pairs further off than this many robust standard deviations take no part.
+
+    Returns
+    -------
+    SmoothFit or None
+        `None` when there are too few pairs for an order of 1 or they lie on a line.
+    """
+    u, v = (x - center[0]) / scale, (y - center[1]) / scale
+    target = np.column_stack([x_ref - x, y_ref - y])
+    used = np.ones(len(x), bool)
+    fit = None
+    for _ in range(8):
+        count = np.count_nonzero(used)
+        top = 0
+        while top < max_order and count >= PAIRS_PER_TERM * count_terms(top + 1):
+            top += 1
+        if top == 0:
+            return fit
+        design = _design(u, v, top)
+        q, r = np.linalg.qr(design[used])
+        diagonal = np.abs(np.diag(r))
+        if diagonal[:3].min() < 1e-4 * diagonal[0]:
+            return fit
+        while diagonal[: count_terms(top)].min() < 1e-9 * diagonal[0]:
+            top -= 1
+        projected = q.T @ target[used]
+        residual = target[used].copy()
+        leverage = np.zeros(count)
+        errors = []
+        for order in range(1, top + 1):
+            columns = slice(count_terms(order - 1) if order > 1 else 0, count_terms(order))
+            residual = residual - q[:, columns] @ projected[columns]
+            leverage = leverage + (q[:, columns] ** 2).sum(axis=1)
+            errors.append(((residual / (1 - np.minimum(leverage, 0.99))[:, None]) ** 2).sum(axis=1))
+        errors = np.array(errors)
+        variances = np.maximum(np.median(errors, axis=1) / (2 * np.log(2)), SMALLEST_SCATTER**2)
+        score = np.minimum(errors, clip**2 * variances.min()).mean(axis=1)
+        order = 1 + int(np.flatnonzero(score <= 1.02 * score.min() + SMALLEST_SCATTER**2)[0])
+        terms = count_terms(order)
+        coefficients = solve_triangular(r[:terms, :terms], projected[:terms])
+        scatter = float(np.sqrt(variances[order - 1]))
+        squared = ((target - design[:, :terms] @ coefficients) ** 2).sum(axis=1)
+        squared[used] = errors[order - 1]
+        fit = SmoothFit(
+            SmoothMap(
+                order, np.ascontiguousarray(coefficients.T), np.asarray(center, float), float(scale)
+            ),
+            scatter,
+            used,
+            r[:terms, :terms],
+        )
+        now = squared <= (clip * scatter) ** 2
+        if (now == used).all():
+            break
+        used = now
+    return fit
