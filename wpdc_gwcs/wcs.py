@@ -260,9 +260,11 @@ def sky_map(wcs, *, image_shape=None, out=None):
     Examples
     --------
     >>> from wpdc_gwcs.wcs import build_wcs, sky_map
-    >>> wcs = build_wcs(crpix=(2, 1), cd=[[-1e-4, 0], [0, 1e-4]], crval=(10, 20), image_shape=(3,
-    5)) >>> ra, dec = sky_map(wcs) >>> ra.shape, float(ra[1, 2]), float(dec[1, 2]) ((3, 5), 10.0,
-    20.0)
+    >>> cd = [[-1e-4, 0], [0, 1e-4]]
+    >>> wcs = build_wcs(crpix=(2, 1), cd=cd, crval=(10, 20), image_shape=(3, 5))
+    >>> ra, dec = sky_map(wcs)
+    >>> ra.shape, float(ra[1, 2]), float(dec[1, 2])
+    ((3, 5), 10.0, 20.0)
     """
     if image_shape is None:
         image_shape = wcs.array_shape
