@@ -1,8 +1,9 @@
-"""Frozen result objects: the instrument (`DistortionSolution`) and the calibrated frame (`Calibration`).
+"""Frozen result objects: the instrument (`DistortionSolution`), the frame (`Calibration`).
 
 ::
 
-    detector px --[instrument: CRPIX, CD0, PV, table]--> undistorted px --[exposure: CD, CRVAL]--> ICRS
+    detector px --[instrument: CRPIX, CD0, PV, table]--> undistorted px --[exposure: CD, CRVAL]-->
+    ICRS
 """
 
 from dataclasses import dataclass, field
@@ -26,9 +27,13 @@ class DistortionSolution:
     cd: np.ndarray  # (2, 2), deg / px, the nominal CD0 in which the PV polynomial stands
     crval: np.ndarray  # (2,), deg, nominal pointing
     pv: PVPolynomial
-    lookup_table: LookupTable | None = None
-    pv_covariance: np.ndarray | None = None  # (2, n, n), deg^2: covariance of the terms of each axis
-    table_sigma: np.ndarray | None = None  # (3, ny_grid, nx_grid): sigma_x, sigma_y [px], rho at the nodes
+    lookup_table: "LookupTable | None" = None
+    pv_covariance: np.ndarray | None = (
+        None  # (2, n, n), deg^2: covariance of the terms of each axis
+    )
+    table_sigma: np.ndarray | None = (
+        None  # (3, ny_grid, nx_grid): sigma_x, sigma_y [px], rho at the nodes
+    )
     residual_map: object | None = None  # ResidualMap
     statistics: dict = field(default_factory=dict)
     settings: dict = field(default_factory=dict)
@@ -36,9 +41,14 @@ class DistortionSolution:
 
     @cached_property
     def wcs(self):
+        """WCS about the nominal pointing, `gwcs.WCS`."""
         return build_wcs(
-            crpix=self.crpix, cd=self.cd, crval=self.crval, pv=self.pv,
-            lookup_table=self.lookup_table, image_shape=self.image_shape,
+            crpix=self.crpix,
+            cd=self.cd,
+            crval=self.crval,
+            pv=self.pv,
+            lookup_table=self.lookup_table,
+            image_shape=self.image_shape,
         )
 
 
@@ -59,8 +69,14 @@ class Calibration:
 
     @cached_property
     def wcs(self):
+        """WCS of the frame, `gwcs.WCS`."""
         s = self.solution
         return build_wcs(
-            crpix=s.crpix, cd=self.cd, crval=self.crval, pv=s.pv, pv_cd=s.cd,
-            lookup_table=s.lookup_table, image_shape=s.image_shape,
+            crpix=s.crpix,
+            cd=self.cd,
+            crval=self.crval,
+            pv=s.pv,
+            pv_cd=s.cd,
+            lookup_table=s.lookup_table,
+            image_shape=s.image_shape,
         )

@@ -1,0 +1,1003 @@
+"""One instrument, many exposures: PV and table of a detector, six numbers for each frame.
+
+::
+
+    pairs of all exposures --align--> attitudes, outliers, errors
+        --+--> PV (distance-weighted) --> residual maps --> table --> attitudes --+--> solution
+          +------------------------- until nothing moves -------------------------+
+
+The distortion is a property of the detector and stable; CRVAL and CD belong to the exposure.  A
+polynomial of its own for each exposure, the paper's first phase, carries that exposure's star noise
+into the corners; one for all does not.
+
+Gauge: the PV polynomial has no constant and unit linear terms, so that CRVAL is the sky at CRPIX
+and CD the local scale there.  What a fit puts into these terms is moved into the attitudes,
+exactly.
+"""
+
+import logging
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from scipy.optimize import nnls
+from scipy.spatial import ConvexHull, QhullError
+
+from wpdc_gwcs.exceptions import FitError
+from wpdc_gwcs.fitting import (
+    MIN_STARS_ATTITUDE,
+    RadialWeight,
+    WPDCFitter,
+    fit_attitude,
+    robust_sigma,
+    solve_linear,
+)
+from wpdc_gwcs.lookup import N_FOLDS, ResidualMap, build_lookup_table
+from wpdc_gwcs.models import PVPolynomial, deproject, project, pv_terms
+from wpdc_gwcs.solution import DistortionSolution
+
+__all__ = ["Exposure", "ExposureFit", "InstrumentResult", "solve_instrument"]
+
+log = logging.getLogger(__name__)
+
+# Alternation ends when no exposure moves by more than this anywhere, px.
+_TOLERANCE = 1e-4
+_MAX_ROUNDS = 12
+
+# Degree of the smooth surface that stands in for the instrument while outliers are found, and stars
+# per coefficient.
+_ALIGN_DEGREE = 7
+_STARS_PER_TERM = 12
+
+# Scatter that no distortion model leaves of right pairs, px.
+_MAX_SCATTER = 2.0
+
+# Uncertainty at the far corner of the detector beyond which an attitude is not delivered, px.
+_MAX_CORNER_SIGMA = 1.0
+
+# Smallest share of the detector that the stars' outline covers.
+_MIN_COVERAGE = 0.2
+
+# Fewer exposures do not tell how much attitudes vary.
+_MIN_EXPOSURES_POOL = 5
+
+# An exposure whose scatter is this many times that of the others has wrong pairs.
+_REJECT_RATIO = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Pairs of one exposure, and where it was thought to point.
+
+    Parameters
+    ----------
+    name : str
+        Name of the exposure, for messages.
+    x, y : (N,) array_like
+        Measured positions, px, zero based.
+    ra, dec : (N,) array_like
+        Reference positions at the epoch of the exposure, deg.
+    crval : (2,) array_like
+        Starting RA and Dec of the reference point, deg.
+    cd : (2, 2) array_like
+        Starting linear matrix, deg / px.
+    x_err, y_err : (N,) array_like, optional
+        Total 1-sigma errors (centroid and reference), px; estimated from the residuals if not
+        given.
+    use : (N,) array_like of bool, optional
+        Stars that may be fitted; the others (held out) only get residuals.
+    """
+
+    name: str
+    x: np.ndarray
+    y: np.ndarray
+    ra: np.ndarray
+    dec: np.ndarray
+    crval: np.ndarray
+    cd: np.ndarray
+    x_err: np.ndarray | None = None
+    y_err: np.ndarray | None = None
+    use: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureFit:
+    """What the joint solution found for one exposure.
+
+    Parameters
+    ----------
+    name : str
+        Name of the exposure.
+    crval : (2,) ndarray
+        RA and Dec of the reference point, deg.
+    cd : (2, 2) ndarray
+        Linear matrix, deg / px.
+    covariance : (6, 6) ndarray
+        Of the errors (ax, bxx, bxy, ay, byx, byy), see `wpdc_gwcs.fitting.AttitudeFit`.
+    dx, dy : (N,) ndarray
+        Residuals X'' - X_ref, Y'' - Y_ref of all pairs given, undistorted px; NaN where a position
+        is NaN.
+    x_err, y_err : (N,) ndarray
+        Errors of the pairs as the fit found them: those given, rescaled, with a floor.
+    used : (N,) ndarray of bool
+        Pairs that were fitted: allowed, valid and not clipped.
+    pv : PVPolynomial or None
+        The exposure's own polynomial with ``refine="pv"``.
+    pv_covariance : (2, n, n) ndarray or None
+        Covariance of its terms, deg^2.
+    reason : str or None
+        Why the exposure was left out; its numbers are then the starting values.
+    statistics : dict
+        Counts and scatter of the pairs used, px.
+    """
+
+    name: str
+    crval: np.ndarray
+    cd: np.ndarray
+    covariance: np.ndarray
+    dx: np.ndarray
+    dy: np.ndarray
+    x_err: np.ndarray
+    y_err: np.ndarray
+    used: np.ndarray
+    pv: "PVPolynomial | None" = None
+    pv_covariance: np.ndarray | None = None
+    reason: str | None = None
+    statistics: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentResult:
+    """The instrument and all its exposures.
+
+    Parameters
+    ----------
+    solution : DistortionSolution
+        What the exposures share.
+    exposures : tuple of ExposureFit
+        One per exposure given, in that order.
+    rejected : dict of str
+        Names of the exposures that were left out, and why.
+    """
+
+    solution: DistortionSolution
+    exposures: tuple
+    rejected: dict
+
+
+def solve_instrument(
+    exposures,
+    *,
+    image_shape,
+    crpix=None,
+    cd=None,
+    weight=None,
+    degree=3,
+    n_grid=50,
+    lut="auto",
+    refine="attitude",
+    solution=None,
+    update=False,
+    pool_attitudes=True,
+    clip=4.0,
+    detector="",
+    seed=0,
+):
+    r"""Solve for the distortion of one detector and the attitude of each of its exposures.
+
+    Parameters
+    ----------
+    exposures : sequence of Exposure
+        Pairs of every exposure.
+    image_shape : (int, int)
+        Shape ``(ny, nx)`` of the detector.
+    crpix : (2,) array_like, optional
+        Reference point, px, zero based; the centre of the detector, or that of ``solution``, if not
+        given.
+    cd : (2, 2) array_like, optional
+        Nominal matrix CD0 in which the polynomial stands, deg / px; the mean of the solved ones if
+        not given.
+    weight : RadialWeight, optional
+        Radial weight of the polynomial; ``exp-sqrt`` with 0.87 times half the shorter side if not
+        given.
+    degree : int, optional
+        Degree of the PV polynomial.  With fewer than three stars per coefficient inside the weight
+        it is lowered.
+    n_grid : int, optional
+        Nodes of the look-up table along each axis.
+    lut : {'auto', 'always', 'none'}, optional
+        Whether there is a table; ``auto`` asks the data.
+    refine : {'attitude', 'pv', 'auto'}, optional
+        What an exposure has of its own: six linear numbers, also a polynomial (the paper's way), or
+        whichever predicts left-out stars better.
+    solution : DistortionSolution, optional
+        Stored instrument: only attitudes are fitted.
+    update : bool, optional
+        Add the residuals of these exposures to those of ``solution`` and make its table anew.
+    pool_attitudes : bool, optional
+        Let five or more exposures tell how much scale, rotation and skew really vary between them,
+        and draw each exposure's towards their mean accordingly.  No effect where the variation
+        exceeds the errors.
+    clip : float, optional
+        Pairs with residuals of more than this many robust standard deviations are left out.
+    detector : str, optional
+        Name of the detector.
+    seed : int, optional
+        Seed of the division of a single exposure's stars for cross-validation.
+
+    Returns
+    -------
+    InstrumentResult
+        Solution, exposures, and those that were rejected.
+
+    Raises
+    ------
+    FitError
+        If the pairs cannot determine what is asked for; the message names the numbers.
+    ValueError
+        If an option has a wrong value.
+
+    Notes
+    -----
+    The undistorted position is :math:`X'' = CD_0^{-1} PV(CD_0 (x - x_0)) + x_0 - \Delta(x)`, and
+    :math:`CD_e (X'' - x_0)` is the place on the tangent plane about CRVAL of exposure e.
+
+    1. A smooth surface stands in for the instrument; attitudes and surface alternate, outliers are
+       clipped, exposures that do not agree with the others are rejected, and the errors of the
+       pairs are rescaled.
+    2. The polynomial minimises :math:`\sum w(r_i) \Delta_i^2 / \sigma_i^2` over all exposures.
+       Its linear part L, c goes into the attitudes: :math:`CD_e \leftarrow CD_e CD_0^{-1} L CD_0`,
+       :math:`PV \leftarrow L^{-1} (PV - c)`, CRVAL moves, and the reference stars are projected
+       about the new one.
+    3. The table takes what is left (`build_lookup_table`), the attitudes are fitted to all stars,
+       and so on until no exposure moves by 1e-4 px anywhere.
+
+    References
+    ----------
+    WPDC-2P, arXiv:2603.09193, section 3; Bernstein et al. (2017), PASP 129, 074503 (gbdes).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.instrument import Exposure, solve_instrument
+    >>> from wpdc_gwcs.models import deproject
+    >>> cd, centre, rng = np.array([[-2e-5, 0], [0, 2e-5]]), 1023.5, np.random.default_rng(1)
+    >>> exposures = []
+    >>> for k in range(3):
+    ...     x, y = rng.uniform(0, 2047, (2, 500))
+    ...     u, v = (x - centre) / 1024, (y - centre) / 1024
+    ...     plane = cd @ [x - centre + 3 * u * (u**2 + v**2), y - centre]
+    ...     ra, dec = deproject(*plane, (120.0 + 0.01 * k, 30.0))
+    ...     exposures.append(Exposure(f"e{k}", x, y, ra, dec, crval=(120.0, 30.0), cd=cd))
+    >>> result = solve_instrument(exposures, image_shape=(2048, 2048))
+    >>> result.exposures[2].crval
+    array([120.02, 30. ])
+    """
+    if refine not in ("attitude", "pv", "auto"):
+        raise ValueError(f"refine must be 'attitude', 'pv' or 'auto', got {refine!r}")
+    if lut not in ("auto", "always", "none"):
+        raise ValueError(f"lut must be 'auto', 'always' or 'none', got {lut!r}")
+    image_shape = tuple(int(n) for n in image_shape)
+    exposures = list(exposures)
+    if not exposures:
+        raise FitError("no exposure was given")
+    if solution is not None and tuple(solution.image_shape) != image_shape:
+        raise FitError(
+            f"the stored solution is for a detector of {tuple(solution.image_shape)} px (ny, "
+            "nx), these exposures have "
+            f"{image_shape}"
+        )
+    if update and solution is None:
+        raise ValueError("update needs a stored solution")
+    if solution is not None:
+        crpix, cd = solution.crpix, solution.cd
+    if crpix is None:
+        crpix = 0.5 * (np.array(image_shape[::-1]) - 1.0)
+    crpix = np.array(crpix, dtype=float)
+    if weight is None:
+        weight = RadialWeight.for_shape(image_shape)
+
+    pairs = _Pairs(exposures, image_shape, crpix)
+    settings = {
+        "weight": weight.name, "r0": float(weight.r0), "degree": int(degree),
+        "n_grid": int(n_grid), "lut": lut, "refine": refine,
+        "clip": float(clip), "pool_attitudes": bool(pool_attitudes),
+    }  # fmt: skip
+    solver = _Solver(pairs, weight, clip, pool=pool_attitudes, seed=seed)
+    if solution is None:
+        solver.align()
+        solver.solve(cd, degree, n_grid, lut)
+    else:
+        solver.attach(solution)
+        if update:
+            solver.update(solution, n_grid)
+    solver.refine(refine)
+    return solver.result(detector, settings, solution)
+
+
+class _Pairs:
+    """All pairs of all exposures in flat arrays, with one slice per exposure."""
+
+    def __init__(self, exposures, image_shape, crpix):
+        self.exposures, self.image_shape, self.crpix = exposures, image_shape, crpix
+        sizes = [np.size(e.x) for e in exposures]
+        edges = np.concatenate([[0], np.cumsum(sizes)])
+        self.slices = [slice(a, b) for a, b in zip(edges[:-1], edges[1:])]
+        n = int(edges[-1])
+        self.x, self.y, self.ra, self.dec = (np.empty(n) for _ in range(4))
+        self.given_error = np.full((2, n), np.nan)
+        self.has_errors = np.zeros(n, bool)
+        self.valid = np.ones(n, bool)
+        for e, s in zip(exposures, self.slices):
+            for name in ("x", "y", "ra", "dec"):
+                value = np.ravel(np.asarray(getattr(e, name), dtype=float))
+                if value.size != s.stop - s.start:
+                    raise ValueError(
+                        f"exposure {e.name}: {name} has {value.size} values, x has "
+                        f"{s.stop - s.start}"
+                    )
+                getattr(self, name)[s] = value
+            if e.x_err is not None and e.y_err is not None:
+                self.given_error[0, s], self.given_error[1, s] = e.x_err, e.y_err
+                self.has_errors[s] = True
+            if e.use is not None:
+                self.valid[s] &= np.asarray(e.use, bool)
+        ny, nx = image_shape
+        finite = np.isfinite(self.x + self.y + self.ra + self.dec)
+        inside = (np.abs(self.x - 0.5 * (nx - 1)) <= 0.5 * nx) & (
+            np.abs(self.y - 0.5 * (ny - 1)) <= 0.5 * ny
+        )
+        self.finite = finite & inside
+        good_error = (np.isfinite(self.given_error) & (self.given_error > 0)).all(0)
+        self.bad_error = self.has_errors & ~good_error
+        allowed = int(self.valid.sum())
+        self.valid &= self.finite & ~self.bad_error
+        if not np.any(self.valid):
+            raise FitError(
+                f"none of {n} pairs can be used: {int((~finite).sum())} have NaN positions, "
+                f"{int((finite & ~inside).sum())} lie off the detector of {nx} x {ny} px, "
+                f"{int(self.bad_error.sum())} "
+                f"have errors that are NaN, infinite or not positive, {n - allowed} are held out"
+            )
+        # Pairs of no known error count as 1 px until the residuals tell.
+        self.sigma = np.where(self.has_errors & good_error, self.given_error, 1.0)
+        self.half = 0.5 * max(image_shape)
+        self.u = np.where(self.finite, (self.x - 0.5 * (nx - 1)) / self.half, 0.0)
+        self.v = np.where(self.finite, (self.y - 0.5 * (ny - 1)) / self.half, 0.0)
+
+    def __len__(self):
+        return len(self.x)
+
+
+class _Solver:
+    """State of the alternation: attitudes, instrument, residuals, errors, what is kept."""
+
+    def __init__(self, pairs, weight, clip, *, pool, seed):
+        self.pairs, self.weight, self.clip, self.pool = pairs, weight, clip, pool
+        self.crval = [np.array(e.crval, dtype=float) for e in pairs.exposures]
+        self.cd = [np.array(e.cd, dtype=float) for e in pairs.exposures]
+        self.covariance = [np.full((6, 6), np.nan) for _ in pairs.exposures]
+        self.reason = [None] * len(pairs.exposures)
+        self.kept = pairs.valid.copy()
+        self.sigma = pairs.sigma.copy()
+        self.residual = np.full((2, len(pairs)), np.nan)
+        self.scale = np.ones(len(pairs.exposures))
+        self.error_model = {"scale": 1.0, "floor": 0.0}
+        self.table = self.table_info = self.residual_map = None
+        self.own_pv = [None] * len(pairs.exposures)
+        self.pv = self.pv_covariance = self.cd0 = None
+        self.rng = np.random.default_rng(seed)
+        self.rounds = 0
+        self.pooled = {}
+
+    @property
+    def active(self):
+        return [k for k, reason in enumerate(self.reason) if reason is None]
+
+    def reject(self, k, reason):
+        name = self.pairs.exposures[k].name
+        log.warning("exposure %s left out: %s", name, reason)
+        self.reason[k] = reason
+        self.kept[self.pairs.slices[k]] = False
+        if not self.active:
+            if len(self.reason) == 1:
+                raise FitError(f"exposure {name}: {reason}")
+            reasons = "; ".join(f"{e.name}: {r}" for e, r in zip(self.pairs.exposures, self.reason))
+            raise FitError(f"all {len(self.reason)} exposures were left out: {reasons}")
+
+    def fit_attitudes(self, z):
+        """Six numbers per exposure from the undistorted positions z (about the reference point)."""
+        p = self.pairs
+        for k in self.active:
+            s = p.slices[k]
+            try:
+                fit = fit_attitude(
+                    z[0, s], z[1, s], p.ra[s], p.dec[s], crpix=(0.0, 0.0), crval=self.crval[k],
+                    cd=self.cd[k], x_err=self.sigma[0, s], y_err=self.sigma[1, s], clip=self.clip,
+                    used=p.valid[s],
+                )  # fmt: skip
+            except FitError as error:
+                self.reject(k, str(error))
+                continue
+            self.crval[k], self.cd[k], self.covariance[k] = fit.crval, fit.cd, fit.covariance
+            self.residual[0, s], self.residual[1, s] = fit.dx, fit.dy
+            self.kept[s] = fit.used
+            self.scale[k] = float(np.sqrt(np.mean(fit.scale**2)))
+
+    def reference(self, z):
+        """Undistorted position of the reference stars in each exposure's own attitude."""
+        return z - self.residual
+
+    def project_reference(self, k):
+        s = self.pairs.slices[k]
+        plane = np.array(project(self.pairs.ra[s], self.pairs.dec[s], self.crval[k]))
+        return np.linalg.solve(self.cd[k], plane)
+
+    def move(self, k, shift, matrix):
+        """Replace an attitude exactly by that of positions ``shift + matrix @ z``."""
+        self.crval[k] = np.array(deproject(*(self.cd[k] @ shift), self.crval[k]))
+        self.cd[k] = self.cd[k] @ matrix
+
+    def align(self):
+        """Attitudes, outliers and errors, with a smooth surface for the instrument."""
+        p = self.pairs
+        n = int(p.valid.sum())
+        _check_coverage(p)
+        degree = max(
+            [
+                d
+                for d in range(1, _ALIGN_DEGREE + 1)
+                if _STARS_PER_TERM * (d + 1) * (d + 2) // 2 <= n
+            ],
+            default=1,
+        )
+        a, b = legvander(p.u, degree), legvander(p.v, degree)
+        basis = np.stack(
+            [a[:, t - j] * b[:, j] for t in range(degree + 1) for j in range(t + 1)], axis=1
+        )
+        position = np.where(p.finite, np.array([p.x, p.y]) - p.crpix[:, None], 0.0)
+        surface = np.zeros((basis.shape[1], 2))
+        before = None
+        for _ in range(_MAX_ROUNDS):
+            z = position + (basis @ surface).T
+            self.fit_attitudes(z)
+            target = self.reference(z) - position
+            surface = self._fit_surface(basis, target)
+            residual = position + (basis @ surface).T - self.reference(z)
+            if before is not None:
+                moved = np.sqrt(np.mean((residual - before)[:, self.kept] ** 2))
+                if moved < 1e-2 * np.median(np.abs(residual[:, self.kept])):
+                    break
+            before = residual
+        self._reject_exposures()
+        self.rescale_errors(basis.shape[1] - 3)
+
+    def _fit_surface(self, basis, target):
+        # An exposure with wrong pairs has a large scatter and counts for nothing.
+        weight = np.where(self.kept, 1.0, 0.0) / self.sigma**2
+        for k in self.active:
+            weight[:, self.pairs.slices[k]] /= max(self.scale[k], 1e-6) ** 2
+        target = np.where(self.kept, target, 0.0)
+        surface = np.empty((basis.shape[1], 2))
+        for axis in range(2):
+            weighted = basis * weight[axis][:, None]
+            # Legendre products: well conditioned, and what the stars do not determine stays zero.
+            surface[:, axis] = np.linalg.lstsq(
+                basis.T @ weighted, weighted.T @ target[axis], rcond=1e-11
+            )[0]
+        return surface
+
+    def _reject_exposures(self):
+        scales = {k: self._scatter(k) for k in self.active}
+        typical = np.median(list(scales.values()))
+        for k, scatter in scales.items():
+            if len(scales) > 2 and scatter > _REJECT_RATIO * typical:
+                self.reject(
+                    k,
+                    f"its residuals scatter by {scatter:.3g} px, those of the others by "
+                    f"{typical:.3g} px: wrong pairs",
+                )
+            elif scatter > _MAX_SCATTER:
+                self.reject(k, f"its residuals scatter by {scatter:.3g} px: wrong pairs")
+
+    def _scatter(self, k):
+        s = self.pairs.slices[k]
+        valid = self.pairs.valid[s]
+        return max(robust_sigma(r[s][valid]) for r in self.residual)
+
+    def rescale_errors(self, n_parameters=None):
+        """Scale and floor of the errors from the residuals; see `_error_model`."""
+        p = self.pairs
+        kept = self.kept
+        n = int(kept.sum())
+        if n_parameters is None:
+            n_parameters = len(self.pv.term_indices) - 3
+            if self.table_info is not None:
+                n_parameters = max(n_parameters, self.table_info.choice.freedom - 3)
+        freedom = n_parameters + 3 * len(self.active)
+        inflation = np.sqrt(n / max(n - freedom, 0.1 * n))
+        for known in (True, False):
+            group = kept & (p.has_errors == known)
+            if not np.any(group):
+                continue
+            scale, floor = _error_model(
+                self.residual[:, group] * inflation, p.sigma[:, group], fit_floor=known
+            )
+            everyone = p.has_errors == known
+            self.sigma[:, everyone] = np.sqrt((scale * p.sigma[:, everyone]) ** 2 + floor**2)
+            self.error_model = {"scale": scale, "floor": floor}
+
+    def solve(self, cd, degree, n_grid, lut):
+        """PV, table and attitudes in turn."""
+        if cd is None:
+            cd = np.mean([self.cd[k] for k in self.active], axis=0)
+        self.cd0 = np.array(cd, dtype=float)
+        self.degree = self._affordable_degree(degree)
+        folds = self._folds()
+        choice, places = None, None
+        for self.rounds in range(1, _MAX_ROUNDS + 1):
+            self.fit_pv()
+            z = self.polynomial_positions(self.pairs.x, self.pairs.y)
+            if lut != "none":
+                self.residual_map = self._residual_map(z, folds)
+                self.table, info = build_lookup_table(
+                    self.residual_map, n_grid, choice=choice, lut=lut, draft=True
+                )
+                if choice is None:
+                    choice, self.table_info = info.choice, info
+            self.settle_attitudes(z)
+            if self.rounds == 1:
+                # The surface of the alignment may have left structure that the table takes: then
+                # the errors were too large, and the smoothing chosen with them too.
+                before = self.sigma
+                self.rescale_errors()
+                if np.abs(np.median(self.sigma[:, self.kept] / before[:, self.kept]) - 1) > 0.05:
+                    choice = None
+            places, moved = self._places(places)
+            if moved < _TOLERANCE:
+                break
+        if self.table is not None:
+            self.residual_map = self._residual_map(z, folds)
+            self.table, info = build_lookup_table(self.residual_map, n_grid, choice=choice, lut=lut)
+            self.table_info = replace(info, candidates=self.table_info.candidates)
+            self.settle_attitudes(z)
+        self.rescale_errors()
+        log.info("instrument solved in %d rounds from %d pairs", self.rounds, self.kept.sum())
+
+    def attach(self, solution):
+        """Attitudes only, with a stored instrument."""
+        self.cd0, self.pv, self.degree = solution.cd, solution.pv, solution.pv.degree
+        self.pv_covariance = solution.pv_covariance
+        self.table, self.table_sigma = solution.lookup_table, solution.table_sigma
+        self.residual_map = solution.residual_map
+        z = self.polynomial_positions(self.pairs.x, self.pairs.y)
+        self.settle_attitudes(z)
+        self._reject_exposures()
+        self.rescale_errors()
+        self.settle_attitudes(z)
+        self._reject_unconstrained()
+
+    def update(self, solution, n_grid):
+        """Table anew from the stored residuals and those of these exposures."""
+        if solution.residual_map is None:
+            raise FitError("the stored solution holds no residual map: it cannot be updated")
+        z = self.polynomial_positions(self.pairs.x, self.pairs.y)
+        folds = self._folds()
+        choice, places = None, None
+        for self.rounds in range(1, _MAX_ROUNDS + 1):
+            self.residual_map = solution.residual_map + self._residual_map(z, folds)
+            self.table, info = build_lookup_table(
+                self.residual_map, n_grid, choice=choice, draft=True
+            )
+            if choice is None:
+                choice, self.table_info = info.choice, info
+            self.settle_attitudes(z)
+            places, moved = self._places(places)
+            if moved < _TOLERANCE:
+                break
+        if self.table is not None:
+            self.table, info = build_lookup_table(self.residual_map, n_grid, choice=choice)
+            self.table_info = replace(info, candidates=self.table_info.candidates)
+            self.settle_attitudes(z)
+        self.rescale_errors()
+
+    def _affordable_degree(self, degree):
+        p = self.pairs
+        distance = np.hypot(p.x - p.crpix[0], p.y - p.crpix[1])[self.kept]
+        n = int(np.sum(self.weight(distance) > 0.5))
+        if n < MIN_STARS_ATTITUDE:
+            raise FitError(
+                f"only {n} of {distance.size} stars have a weight above 0.5 ({self.weight.name}, "
+                f"r0 = {self.weight.r0:.6g} px); {MIN_STARS_ATTITUDE} are needed"
+            )
+        lowered = degree
+        while lowered > 1 and 3 * len(pv_terms(lowered).index) > n:
+            lowered -= 1
+        if lowered < degree:
+            log.warning(
+                "%d stars within r0: PV polynomial of degree %d, not %d", n, lowered, degree
+            )
+        return lowered
+
+    def _folds(self):
+        """Group of each pair for cross-validation: by exposure, or at random for one or two."""
+        folds = self.rng.integers(0, N_FOLDS, len(self.pairs))
+        if len(self.active) >= 3:
+            for i, k in enumerate(self.active):
+                folds[self.pairs.slices[k]] = i % N_FOLDS
+        return folds
+
+    def fit_pv(self):
+        """Weighted polynomial of all exposures; its linear part goes into the attitudes."""
+        p = self.pairs
+        reference = np.zeros((2, len(p)))
+        for k in self.active:
+            reference[:, p.slices[k]] = self.project_reference(k)
+        fitter = WPDCFitter(weight=self.weight, pixel_scale=self.cd0)
+        kept = self.kept
+        self.pv = fitter(
+            PVPolynomial(self.degree),
+            *(self.cd0 @ self._offset(p.x, p.y)[:, kept]),
+            *(self.cd0 @ reference[:, kept]),
+            weights=1.0 / np.sqrt(self.cd0**2 @ self.sigma[:, kept] ** 2),
+        )
+        n = len(self.pv.term_indices)
+        full = fitter.fit_info["covariance"]
+        self.pv_covariance = _blocks(full, n)
+        self.pv, constant, linear = _split_linear(self.pv)
+        inverse = np.linalg.inv(self.cd0)
+        for k in self.active:
+            self.move(k, inverse @ constant, inverse @ linear @ self.cd0)
+
+    def _offset(self, x, y):
+        return np.array([x, y]) - self.pairs.crpix.reshape(2, *[1] * np.ndim(x))
+
+    def polynomial_positions(self, x, y, pv=None):
+        """Positions about the reference point after the polynomial, px."""
+        xi, eta = np.tensordot(self.cd0, self._offset(x, y), axes=1)
+        plane = np.array((self.pv if pv is None else pv)(xi, eta))
+        return np.tensordot(np.linalg.inv(self.cd0), plane, axes=1)
+
+    def apply_table(self, z):
+        """Undistorted positions of all pairs about the reference point."""
+        if self.table is None:
+            return z
+        p = self.pairs
+        # Pairs off the detector get no residual; the table must not make NaN of them on the way.
+        ny, nx = p.image_shape
+        x, y = (np.where(p.finite, a, 0.5 * n) for a, n in ((p.x, nx), (p.y, ny)))
+        return z - np.array(self.table(x, y))
+
+    def _residual_map(self, z, folds):
+        p, kept = self.pairs, self.kept
+        reference = np.zeros_like(z)
+        for k in self.active:
+            reference[:, p.slices[k]] = self.project_reference(k)
+        dx, dy = (z - reference)[:, kept]
+        return ResidualMap.from_residuals(
+            p.x[kept], p.y[kept], dx, dy, x_err=self.sigma[0, kept], y_err=self.sigma[1, kept],
+            image_shape=p.image_shape, fold=folds[kept],
+        )  # fmt: skip
+
+    def settle_attitudes(self, z):
+        """Fit all attitudes with the instrument fixed, drawn together where they do not differ."""
+        z = self.apply_table(z)
+        self.fit_attitudes(z)
+        if self.pool:
+            self._pool(z)
+
+    def _pool(self, z):
+        active = self.active
+        if len(active) < _MIN_EXPOSURES_POOL:
+            return
+        mean = np.mean([self.cd[k] for k in active], axis=0)
+        b = np.array([np.linalg.solve(mean, self.cd[k]) - np.eye(2) for k in active])
+        covariance = np.array([self.covariance[k] for k in active])
+        posterior, covariance, self.pooled = _pool_linear(b, covariance)
+        for k, (shift, matrix), c in zip(active, posterior, covariance):
+            self.crval[k] = np.array(deproject(*(self.cd[k] @ shift), self.crval[k]))
+            self.cd[k] = mean @ (np.eye(2) + matrix)
+            self.covariance[k] = c
+            s = self.pairs.slices[k]
+            self.residual[:, s] = z[:, s] - self.project_reference(k)
+
+    def _places(self, before):
+        """Sky positions of a grid in every exposure, and their largest move, px."""
+        ny, nx = self.pairs.image_shape
+        x, y = (
+            a.ravel() for a in np.meshgrid(np.linspace(0, nx - 1, 9), np.linspace(0, ny - 1, 9))
+        )
+        z = self.polynomial_positions(x, y)
+        if self.table is not None:
+            z = z - np.array(self.table(x, y))
+        places, moved = {}, 0.0
+        for k in self.active:
+            places[k] = deproject(*(self.cd[k] @ z), self.crval[k])
+            if before is None or k not in before:
+                moved = np.inf
+                continue
+            old = np.linalg.solve(self.cd[k], np.array(project(*before[k], self.crval[k])))
+            moved = max(moved, float(np.abs(old - z).max()))
+        return places, moved
+
+    def _reject_unconstrained(self):
+        """Leave out exposures whose attitude says nothing about the far side of the detector."""
+        ny, nx = self.pairs.image_shape
+        corners = self._offset(
+            np.array([0, nx - 1, 0, nx - 1.0]), np.array([0, 0, ny - 1, ny - 1.0])
+        )
+        for k in self.active:
+            sigma = np.sqrt(_attitude_variance(self.covariance[k], corners).max())
+            if sigma > _MAX_CORNER_SIGMA:
+                n = int(self.kept[self.pairs.slices[k]].sum())
+                self.reject(
+                    k,
+                    f"its {n} stars leave the far corner of the detector uncertain by "
+                    f"{sigma:.2g} px",
+                )
+
+    def refine(self, refine):
+        """Give each exposure a polynomial of its own, the table fixed."""
+        if refine == "attitude":
+            return
+        p = self.pairs
+        z = self.polynomial_positions(p.x, p.y)
+        table = z - self.apply_table(z)
+        if refine == "auto" and not self._own_pv_predicts(table):
+            return
+        inverse = np.linalg.inv(self.cd0)
+        n_terms = len(self.pv.term_indices)
+        for k in self.active:
+            s = p.slices[k]
+            kept = self.kept[s]
+            offset = self._offset(p.x[s], p.y[s])
+            if np.sum(self.weight(np.hypot(*offset[:, kept])) > 0.5) < 3 * n_terms:
+                log.info("exposure %s keeps the shared polynomial", p.exposures[k].name)
+                continue
+            fitter = WPDCFitter(weight=self.weight, pixel_scale=self.cd0)
+            target = self.project_reference(k) + table[:, s]
+            pv = fitter(
+                PVPolynomial(self.degree),
+                *(self.cd0 @ offset[:, kept]),
+                *(self.cd0 @ target[:, kept]),
+                weights=1.0 / np.sqrt(self.cd0**2 @ self.sigma[:, s][:, kept] ** 2),
+            )
+            pv, constant, linear = _split_linear(pv)
+            # The table stands behind the polynomial: its own linear part is not touched by the
+            # gauge.
+            self.own_pv[k] = pv, _blocks(fitter.fit_info["covariance"], n_terms)
+            matrix = inverse @ linear @ self.cd0
+            self.move(k, inverse @ constant, matrix)
+            undistorted = self.polynomial_positions(p.x[s], p.y[s], pv) - table[:, s]
+            self.residual[:, s] = undistorted - self.project_reference(k)
+
+    def _own_pv_predicts(self, table):
+        """Whether own polynomials predict left-out stars better; both fits leave one out."""
+        p = self.pairs
+        shared = own = 0.0
+        for k in self.active:
+            s = p.slices[k]
+            kept = self.kept[s]
+            offset = self._offset(p.x[s], p.y[s])[:, kept]
+            radial = self.weight(np.hypot(*offset))
+            if np.sum(radial > 0.5) < 3 * len(self.pv.term_indices):
+                continue
+            a, b = offset / p.half
+            terms = pv_terms(self.degree)
+            cubic = a[:, None] ** terms.own * b[:, None] ** terms.other
+            linear = cubic[:, :3]
+            target = self.project_reference(k)[:, kept] + table[:, s][:, kept]
+            for axis in range(2):
+                inverse_variance = self.sigma[axis, s][kept] ** -2
+                press = self.residual[axis, s][kept]
+                hat = solve_linear(linear, press, inverse_variance, leverage=True).leverage
+                shared += np.sum((press / (1 - hat)) ** 2 * inverse_variance)
+                fit = solve_linear(cubic, target[axis], radial * inverse_variance, leverage=True)
+                press = (target[axis] - cubic @ fit.parameters) / (1 - fit.leverage)
+                own += np.sum(press**2 * inverse_variance)
+        log.info("own polynomials: %.6g, shared: %.6g", own, shared)
+        return own < shared
+
+    def result(self, detector, settings, stored):
+        """Frozen results of the state."""
+        p = self.pairs
+        fits = []
+        for k, e in enumerate(p.exposures):
+            s = p.slices[k]
+            residual = np.where(p.finite[s], self.residual[:, s], np.nan)
+            kept = self.kept[s]
+            rejected = self.reason[k] is not None
+            pv, covariance = self.own_pv[k] or (None, None)
+            fits.append(
+                ExposureFit(
+                    name=e.name,
+                    crval=np.array(e.crval, dtype=float) if rejected else self.crval[k],
+                    cd=np.array(e.cd, dtype=float) if rejected else self.cd[k],
+                    covariance=self.covariance[k],
+                    dx=residual[0],
+                    dy=residual[1],
+                    x_err=self.sigma[0, s],
+                    y_err=self.sigma[1, s],
+                    used=kept,
+                    pv=pv,
+                    pv_covariance=covariance,
+                    reason=self.reason[k],
+                    statistics={
+                        "n_pairs": int(kept.size),
+                        "n_used": int(kept.sum()),
+                        "scatter_dx": robust_sigma(residual[0][kept]),
+                        "scatter_dy": robust_sigma(residual[1][kept]),
+                    },
+                )
+            )
+        rejected = {f.name: f.reason for f in fits if f.reason is not None}
+        return InstrumentResult(self._solution(detector, settings, stored), tuple(fits), rejected)
+
+    def _solution(self, detector, settings, stored):
+        statistics = {
+            "n_exposures": len(self.active),
+            "n_used": int(self.kept.sum()),
+            "rounds": self.rounds,
+            "error_scale": float(self.error_model["scale"]),
+            "error_floor": float(self.error_model["floor"]),
+        }
+        if self.pooled:
+            statistics["attitude_variation"] = self.pooled
+        info = self.table_info
+        if info is not None:
+            statistics["table"] = asdict(info.choice)
+            statistics["table_chi2"] = float(info.chi2)
+            statistics["table_candidates"] = [asdict(c) for c in info.candidates]
+        if stored is not None:
+            if info is None:
+                return stored
+            return replace(
+                stored,
+                lookup_table=self.table,
+                table_sigma=info.sigma,
+                residual_map=self.residual_map,
+                statistics={**stored.statistics, **statistics},
+            )
+        # The mean pointing, as a vector: right ascensions do not average across 0 h.
+        ra, dec = np.radians([self.crval[k] for k in self.active]).T
+        mean = np.mean([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+        crval = np.degrees(
+            [np.arctan2(mean[1], mean[0]) % (2 * np.pi), np.arctan2(mean[2], np.hypot(*mean[:2]))]
+        )
+        return DistortionSolution(
+            detector=detector,
+            image_shape=self.pairs.image_shape,
+            crpix=self.pairs.crpix,
+            cd=self.cd0,
+            crval=crval,
+            pv=self.pv,
+            lookup_table=self.table,
+            pv_covariance=self.pv_covariance,
+            table_sigma=None if info is None else info.sigma,
+            residual_map=self.residual_map,
+            statistics=statistics,
+            settings=settings,
+        )
+
+
+def _blocks(covariance, n):
+    return np.array([covariance[:n, :n], covariance[n:, n:]])
+
+
+def _split_linear(pv):
+    """Take constant and linear part out of a polynomial, PV = c + L PV'."""
+    terms = pv_terms(pv.degree)
+    own, other = pv.coefficients
+    # Terms of axis 2 are in (eta, xi): bring both axes to the order of axis 1.
+    swap = np.array(
+        [
+            int(np.flatnonzero((terms.own == b) & (terms.other == a))[0])
+            for a, b in zip(terms.own, terms.other)
+        ]
+    )
+    both = np.array([own, other[swap]])
+    constant, linear = both[:, 0].copy(), both[:, 1:3].copy()
+    both[:, 0] = 0.0
+    both = np.linalg.solve(linear, both)
+    both[:, 1:3] = np.eye(2)
+    return PVPolynomial.from_coefficients([both[0], both[1][swap]], pv.degree), constant, linear
+
+
+def _check_coverage(pairs):
+    """Refuse stars that say nothing about most of the detector."""
+    x, y = pairs.x[pairs.valid], pairs.y[pairs.valid]
+    ny, nx = pairs.image_shape
+    n = len(x)
+    if n < MIN_STARS_ATTITUDE:
+        raise FitError(f"{n} pairs are too few: at least {MIN_STARS_ATTITUDE} are needed")
+    try:
+        share = ConvexHull(np.stack([x, y], axis=1)).volume / (nx * ny)
+    except QhullError:
+        share = 0.0
+    if share < _MIN_COVERAGE:
+        raise FitError(
+            f"the {n} stars span {share:.1%} of the detector (x {x.min():.0f} to {x.max():.0f} "
+            f"of {nx} px, y "
+            f"{y.min():.0f} to {y.max():.0f} of {ny}): at least {_MIN_COVERAGE:.0%} is needed "
+            "for its distortion"
+        )
+
+
+def _error_model(residual, sigma, *, fit_floor):
+    """Scale s and floor f of the errors: robust variance of the residuals = (s sigma)^2 + f^2.
+
+    Stars are put into groups of equal error; the variances of the groups are fitted, each with its
+    own uncertainty.
+    """
+    order = np.argsort(sigma.ravel())
+    r, e = residual.ravel()[order], sigma.ravel()[order]
+    groups = max(1, min(12, len(r) // 200)) if fit_floor else 1
+    parts = np.array_split(np.arange(len(r)), groups)
+    # Residuals over errors: a group may hold a wide range of errors.
+    e2 = np.array([np.median(e[i] ** 2) for i in parts])
+    v = np.array([robust_sigma(r[i] / e[i]) ** 2 for i in parts]) * e2
+    if groups > 1 and e2.max() > 1.5 * e2.min():
+        scale2, floor2 = nnls(
+            np.stack([e2, np.ones_like(e2)], axis=1) / v[:, None], np.ones_like(v)
+        )[0]
+    else:
+        scale2, floor2 = np.median(v / e2), 0.0
+    if scale2 <= 0:
+        # Errors that say nothing about the residuals.
+        scale2 = 1e-6
+    return float(np.sqrt(scale2)), float(np.sqrt(floor2))
+
+
+def _attitude_variance(covariance, z):
+    """Variances of both axes at positions z about the reference point, ``(2, ...)``."""
+    row = np.stack([np.ones_like(z[0]), z[0], z[1]])
+    return np.array(
+        [np.einsum("i...,ij,j...->...", row, covariance[i : i + 3, i : i + 3], row) for i in (0, 3)]
+    )
+
+
+# Scale, rotation and the two shears of a small linear map (bxx, bxy, byx, byy).
+_MODES = np.array([[1, 0, 0, 1], [0, -1, 1, 0], [1, 0, 0, -1], [0, 1, 1, 0]]) / np.sqrt(2)
+_MODE_NAMES = ("scale", "rotation", "stretch", "shear")
+
+
+def _pool_linear(b, covariance):
+    """Draw the linear parts of exposures towards their mean by as much as their scatter warrants.
+
+    Each mode has its own variance between exposures, estimated as the posterior mean under a flat
+    prior of the standard deviation (restricted likelihood), which is never zero: a few exposures do
+    not prove that nothing varies.
+    """
+    n = len(b)
+    modes = b.reshape(n, 4) @ _MODES.T
+    linear = np.array([1, 2, 4, 5])
+    error = np.einsum("ki,eij,kj->ek", _MODES, covariance[:, linear][:, :, linear], _MODES)
+    variance, mean = np.empty(4), np.empty(4)
+    for m in range(4):
+        typical = np.sqrt(np.median(error[:, m]))
+        spread = np.std(modes[:, m])
+        tau = np.linspace(0.0, 5.0 * max(spread, typical), 400)
+        total = error[:, m] + tau[:, None] ** 2
+        w = 1.0 / total
+        centre = np.sum(w * modes[:, m], axis=1) / w.sum(1)
+        like = -0.5 * (
+            np.log(total).sum(1)
+            + np.log(w.sum(1))
+            + np.sum(w * (modes[:, m] - centre[:, None]) ** 2, axis=1)
+        )
+        like = np.exp(like - like.max())
+        variance[m] = np.sum(like * tau**2) / np.sum(like)
+        w = 1.0 / (error[:, m] + variance[m])
+        mean[m] = np.sum(w * modes[:, m]) / w.sum()
+    prior = _MODES.T @ np.diag(1.0 / variance) @ _MODES
+    posterior, covariances = [], []
+    for k in range(n):
+        precision = np.linalg.inv(covariance[k])
+        right = precision @ np.array([0, *b[k].ravel()[:2], 0, *b[k].ravel()[2:]])
+        right[linear] += prior @ (_MODES.T @ mean)
+        precision[np.ix_(linear, linear)] += prior
+        c = np.linalg.inv(precision)
+        theta = (c @ right).reshape(2, 3)
+        posterior.append((theta[:, 0], theta[:, 1:]))
+        covariances.append(c)
+    return posterior, covariances, dict(zip(_MODE_NAMES, map(float, np.sqrt(variance))))

@@ -1,0 +1,806 @@
+"""The look-up table: what the polynomial leaves, averaged over many exposures and interpolated.
+
+::
+
+    residuals of a frame --ResidualMap.from_residuals--> bins --"+" over frames--> bins
+    --build_lookup_table--> LookupTable
+"""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from scipy.interpolate import CubicSpline, RBFInterpolator
+from scipy.linalg import eigh, lapack, qr
+
+from wpdc_gwcs.exceptions import FitError
+from wpdc_gwcs.models import LookupTable
+
+__all__ = ["ResidualMap", "TableChoice", "build_lookup_table"]
+
+log = logging.getLogger(__name__)
+
+# Sums kept in every bin; w = 1 / sigma^2 with sigma^2 the mean of both axes.
+_SUMS = (
+    "n", "w", "wx", "wy", "wxx", "wxy", "wyy",
+    "wdx", "wdy", "wdxdx", "wdxdy", "wdydy", "wwvx", "wwvy",
+)  # fmt: skip
+
+# Bins along the longer side of the detector; about 130 px for the paper's 9216.
+_BINS = 70
+
+# Groups of exposures (or of stars, for one exposure) that cross-validation leaves out in turn.
+N_FOLDS = 5
+
+
+class ResidualMap:
+    """Weighted residuals of any number of stars, binned over the detector, in constant memory.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Shape ``(ny, nx)`` of the detector in px.
+    sums : (K, 14, my, mx) ndarray, optional
+        Sums of an existing map, in the order of `ResidualMap.columns`; empty if not given.
+    shape : (int, int), optional
+        Bins ``(my, mx)``; square bins, 70 along the longer side, if not given.
+
+    Notes
+    -----
+    Each bin holds the count, the weights, the weighted moments of position up to the second and of
+    the residuals up to the second, and the variance of the mean; separately for K = 5 groups of
+    exposures, which cross-validation leaves out in turn.  Maps of the same geometry add up, in any
+    order and grouping.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import ResidualMap
+    >>> x, y = np.random.default_rng(1).uniform(0, 2047, (2, 5000))
+    >>> maps = [
+    ...     ResidualMap.from_residuals(x[i::2], y[i::2], 0.1, -0.2, x_err=0.05, y_err=0.05,
+    ...                                image_shape=(2048, 2048), fold=i) for i in range(2)
+    ... ]
+    >>> total = maps[0] + maps[1]
+    >>> total.n_stars, float(np.nanmax(total.mean[0]))
+    (5000, 0.1)
+    """
+
+    columns = _SUMS
+
+    def __init__(self, image_shape, sums=None, *, shape=None):
+        ny, nx = (int(n) for n in image_shape)
+        if min(ny, nx) < 1:
+            raise ValueError(f"image_shape must be two positive sizes, got {image_shape}")
+        self.image_shape = (ny, nx)
+        if sums is None:
+            if shape is None:
+                # Even numbers, so that pairs of bins can be joined.
+                size = 2 * max(ny, nx) / _BINS
+                shape = (2 * max(1, round(ny / size)), 2 * max(1, round(nx / size)))
+            sums = np.zeros((N_FOLDS, len(_SUMS), *shape))
+        sums = np.asarray(sums, dtype=float)
+        if sums.ndim != 4 or sums.shape[:2] != (N_FOLDS, len(_SUMS)):
+            raise ValueError(
+                f"sums must have shape ({N_FOLDS}, {len(_SUMS)}, my, mx), got {sums.shape}"
+            )
+        self.sums = sums
+
+    @classmethod
+    def from_residuals(cls, x, y, dx, dy, *, x_err, y_err, image_shape, fold=0, shape=None):
+        """Map of the residuals of one frame.
+
+        Parameters
+        ----------
+        x, y : (N,) array_like
+            Positions on the detector, px, zero based.
+        dx, dy : (N,) or float array_like
+            Residuals X' - X_ref and Y' - Y_ref, px.
+        x_err, y_err : (N,) or float array_like
+            1-sigma errors of the residuals, px.
+        image_shape : (int, int)
+            Shape ``(ny, nx)`` of the detector.
+        fold : int or (N,) array_like of int, optional
+            Group of the exposure (or of each star) in cross-validation; any integer.
+        shape : (int, int), optional
+            Bins ``(my, mx)``.
+
+        Returns
+        -------
+        ResidualMap
+            Stars off the detector, or with NaN or non-positive errors, are left out.
+        """
+        self = cls(image_shape, shape=shape)
+        ny, nx = self.image_shape
+        my, mx = self.shape
+        values = np.broadcast_arrays(
+            *(np.asarray(v, dtype=float).ravel() for v in (x, y, dx, dy, x_err, y_err)),
+            np.asarray(fold).ravel(),
+        )
+        x, y, dx, dy, x_err, y_err, fold = values
+        variance = 0.5 * (x_err**2 + y_err**2)
+        good = np.isfinite(x + y + dx + dy + variance) & (variance > 0)
+        good &= (x >= -0.5) & (x <= nx - 0.5) & (y >= -0.5) & (y <= ny - 0.5)
+        x, y, dx, dy, x_err, y_err, fold, variance = (
+            v[good] for v in (x, y, dx, dy, x_err, y_err, fold, variance)
+        )
+        ix = np.minimum(((x + 0.5) * (mx / nx)).astype(int), mx - 1)
+        iy = np.minimum(((y + 0.5) * (my / ny)).astype(int), my - 1)
+        index = ((fold.astype(int) % N_FOLDS) * my + iy) * mx + ix
+        # Moments of position about the bin's centre, or the second ones would be differences of
+        # large numbers.
+        u = x - ((ix + 0.5) * (nx / mx) - 0.5)
+        v = y - ((iy + 0.5) * (ny / my) - 0.5)
+        w = 1.0 / variance
+        terms = (
+            np.ones_like(w), w, w * u, w * v, w * u * u, w * u * v, w * v * v, w * dx, w * dy,
+            w * dx * dx, w * dx * dy, w * dy * dy, w * w * x_err**2, w * w * y_err**2,
+        )  # fmt: skip
+        for k, term in enumerate(terms):
+            self.sums[:, k] = np.bincount(index, weights=term, minlength=N_FOLDS * my * mx).reshape(
+                N_FOLDS, my, mx
+            )
+        return self
+
+    def __add__(self, other):
+        if not isinstance(other, ResidualMap):
+            return NotImplemented
+        if (self.image_shape, self.shape) != (other.image_shape, other.shape):
+            raise ValueError(
+                f"residual maps must be of one geometry: detector {self.image_shape} in "
+                f"{self.shape} bins "
+                f"and {other.image_shape} in {other.shape}"
+            )
+        return ResidualMap(self.image_shape, self.sums + other.sums)
+
+    def __eq__(self, other):
+        if not isinstance(other, ResidualMap):
+            return NotImplemented
+        return self.image_shape == other.image_shape and np.array_equal(self.sums, other.sums)
+
+    __hash__ = None
+
+    def __repr__(self):
+        return f"<ResidualMap {self.image_shape} in {self.shape} bins, {self.n_stars} stars>"
+
+    @property
+    def shape(self):
+        """Bins ``(my, mx)``."""
+        return self.sums.shape[2:]
+
+    @property
+    def n_stars(self):
+        """Stars in the map."""
+        return int(round(self.sums[:, 0].sum()))
+
+    @property
+    def counts(self):
+        """Stars in every bin ``(my, mx)``."""
+        return self.sums[:, 0].sum(0)
+
+    @property
+    def folds(self):
+        """Groups that hold stars."""
+        return np.flatnonzero(self.sums[:, 0].sum((1, 2)) > 0)
+
+    @property
+    def mean(self):
+        """Weighted mean residuals ``(2, my, mx)``, px; NaN where there are no stars."""
+        total = self.sums.sum(0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return total[7:9] / total[1]
+
+    @property
+    def sigma(self):
+        """Standard errors of the mean residuals ``(2, my, mx)``, px, from the stars' errors."""
+        total = self.sums.sum(0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.sqrt(total[12:14]) / total[1]
+
+    @property
+    def centroid(self):
+        """Weighted mean positions ``(2, my, mx)`` of the stars in every bin, px."""
+        total = self.sums.sum(0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return total[2:4] / total[1] + self._centers()
+
+    def _centers(self):
+        (ny, nx), (my, mx) = self.image_shape, self.shape
+        cx = (np.arange(mx) + 0.5) * (nx / mx) - 0.5
+        cy = (np.arange(my) + 0.5) * (ny / my) - 0.5
+        return np.array(np.meshgrid(cx, cy))
+
+    def coarsen(self):
+        """Join pairs of bins along both axes.
+
+        Returns
+        -------
+        ResidualMap
+            With half the bins along each axis.
+
+        Raises
+        ------
+        ValueError
+            If the number of bins along an axis is odd.
+        """
+        my, mx = self.shape
+        if my % 2 or mx % 2:
+            raise ValueError(f"only even numbers of bins can be joined in pairs, got {self.shape}")
+        coarse = ResidualMap(self.image_shape, shape=(my // 2, mx // 2))
+        s = self.sums
+        # Moments move from the centres of the small bins to those of the large ones.
+        ox, oy = self._centers() - coarse._centers().repeat(2, axis=1).repeat(2, axis=2)
+        moved = s.copy()
+        moved[:, 2] += s[:, 1] * ox
+        moved[:, 3] += s[:, 1] * oy
+        moved[:, 4] += 2 * s[:, 2] * ox + s[:, 1] * ox**2
+        moved[:, 5] += s[:, 2] * oy + s[:, 3] * ox + s[:, 1] * ox * oy
+        moved[:, 6] += 2 * s[:, 3] * oy + s[:, 1] * oy**2
+        coarse.sums = moved.reshape(*s.shape[:2], my // 2, 2, mx // 2, 2).sum((3, 5))
+        return coarse
+
+    def without(self, fold):
+        """Leave one group out, for cross-validation.
+
+        Parameters
+        ----------
+        fold : int
+            Group left out.
+
+        Returns
+        -------
+        ResidualMap
+            Of the other groups.
+        """
+        sums = self.sums.copy()
+        sums[fold] = 0.0
+        return ResidualMap(self.image_shape, sums)
+
+    def only(self, fold):
+        """Keep one group alone.
+
+        Parameters
+        ----------
+        fold : int
+            Group kept.
+
+        Returns
+        -------
+        ResidualMap
+            Of that group.
+        """
+        sums = np.zeros_like(self.sums)
+        sums[fold] = self.sums[fold]
+        return ResidualMap(self.image_shape, sums)
+
+    def to_tree(self):
+        """Plain dictionary of numbers and arrays, for files.
+
+        Returns
+        -------
+        dict
+            Accepted by `from_tree`.
+        """
+        return {"image_shape": list(self.image_shape), "columns": list(_SUMS), "sums": self.sums}
+
+    @classmethod
+    def from_tree(cls, tree):
+        """Inverse of `to_tree`.
+
+        Parameters
+        ----------
+        tree : dict
+            As given by `to_tree`.
+
+        Returns
+        -------
+        ResidualMap
+            Equal to the one written.
+
+        Raises
+        ------
+        ValueError
+            If the tree is of another layout.
+        """
+        if list(tree["columns"]) != list(_SUMS):
+            raise ValueError(f"columns of the residual map must be {_SUMS}, got {tree['columns']}")
+        return cls(tuple(tree["image_shape"]), np.array(tree["sums"], dtype=float))
+
+
+@dataclass(frozen=True)
+class TableChoice:
+    """How a look-up table is interpolated from the bins.
+
+    Parameters
+    ----------
+    kernel : str
+        Kernel of `scipy.interpolate.RBFInterpolator`, or ``none`` for no table.
+    degree : int
+        Degree of the polynomial that the interpolator adds.
+    smoothing : float
+        Smoothing of a bin divided by the variance of its mean (px^2); positions in units of half
+        the longer side.
+    epsilon : float
+        Shape parameter of the kernel in the same unit; 1 for kernels without a scale.
+    score : float
+        Cross-validated mean square of the normalised residuals; NaN if not measured.
+    freedom : float
+        Effective number of parameters per axis.
+    """
+
+    kernel: str
+    degree: int = -1
+    smoothing: float = np.nan
+    epsilon: float = 1.0
+    score: float = np.nan
+    freedom: float = 0.0
+
+
+# Kernel, shape parameters and least degree of its polynomial.  The Gaussian of length l has epsilon
+# = 1 / (sqrt(2) l): lengths from three times the detector (all but a polynomial) to a thirteenth of
+# it.
+_KERNELS = (
+    ("thin_plate_spline", (1.0,), 1),
+    ("quintic", (1.0,), 2),
+    ("gaussian", (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.5, 9.0), 1),
+)
+_MAX_DEGREE = 7
+
+# Candidates that go from generalised cross-validation on to cross-validation over exposures.
+_N_SHORTLIST = 6
+
+# Fewer stars than this do not carry a table.
+_MIN_STARS_TABLE = 60
+
+
+def build_lookup_table(
+    residual_map, n_grid=50, *, choice=None, lut="auto", method="cubic", draft=False
+):
+    """Look-up table from binned residuals, with kernel, degree and smoothing chosen from the data.
+
+    Parameters
+    ----------
+    residual_map : ResidualMap or sequence of ResidualMap
+        Residuals of one detector.  Maps of single exposures are put into groups for
+        cross-validation in turn.
+    n_grid : int, optional
+        Nodes of the table along each axis.
+    choice : TableChoice, optional
+        Settings to use; chosen by cross-validation if not given.
+    lut : {'auto', 'always', 'none'}, optional
+        ``auto``: no table where none predicts left-out exposures at least as well; ``always``: the
+        best table; ``none``: no table.
+    method : {'cubic', 'linear'}, optional
+        How the table interpolates between its nodes.
+    draft : bool, optional
+        Interpolate bins twice as large, without uncertainty: a small part of the time, for
+        iterations.
+
+    Returns
+    -------
+    table : LookupTable or None
+        Displacements to subtract, on nodes from one outer edge of the detector to the other; `None`
+        for no table.
+    info : TableInfo
+        The choice made, all candidates with their scores, and the uncertainty of the table at the
+        nodes.
+
+    Raises
+    ------
+    FitError
+        If a table is asked for and the map holds too few stars or bins.
+
+    Notes
+    -----
+    1. Bins are represented by their inverse-variance means at their weighted centroids.  A mean
+       over a bin is not the value at its centroid: half the trace of Hessian times second moments
+       is taken off, with a pilot surface.
+    2. On bins twice as large, every kernel and length is diagonalised once, so that generalised
+       cross-validation over all smoothings (twelve decades) and polynomial degrees costs next to
+       nothing.
+    3. The best few, and no table at all, are compared by leaving out one group of exposures after
+       the other.
+    4. The winner is interpolated on the fine bins by `scipy.interpolate.RBFInterpolator`, with
+       smoothing proportional to the variance of each bin, and the nodes are those whose spline
+       comes closest to it.
+
+    The same smoother is the posterior mean of a Gaussian process whose covariance is the kernel
+    divided by the smoothing; its posterior covariance, without the linear part that the attitudes
+    carry, is the uncertainty at the nodes.
+
+    References
+    ----------
+    WPDC-2P, arXiv:2603.09193, section 3.3; Wahba (1990), Spline Models for Observational Data,
+    chapters 4 and 5.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import ResidualMap, build_lookup_table
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 2047, (2, 4000))
+    >>> dx, dy = np.sin(x / 300) + rng.normal(0, 0.05, (2, 4000))
+    >>> bins = ResidualMap.from_residuals(
+    ...     x, y, dx, dy, x_err=0.05, y_err=0.05, image_shape=(2048, 2048)
+    ... )
+    >>> table, info = build_lookup_table(bins, 20)
+    >>> bool(abs(table(1000.0, 1000.0)[0] - np.sin(1000 / 300)) < 0.02)
+    True
+    """
+    if lut not in ("auto", "always", "none"):
+        raise ValueError(f"lut must be 'auto', 'always' or 'none', got {lut!r}")
+    if not 4 <= n_grid <= 1000:
+        raise ValueError(f"n_grid must be between 4 and 1000, got {n_grid}")
+    if not isinstance(residual_map, ResidualMap):
+        residual_map = _assign_folds(residual_map)
+    if lut == "none" or (choice is not None and choice.kernel == "none"):
+        return None, TableInfo(TableChoice("none"), (), None, np.nan)
+    n = residual_map.n_stars
+    if n < _MIN_STARS_TABLE:
+        if lut == "always" or choice is not None:
+            raise FitError(f"{n} stars cannot carry a look-up table, {_MIN_STARS_TABLE} are needed")
+        return None, TableInfo(TableChoice("none"), (), None, np.nan)
+
+    coarse = residual_map.coarsen()
+    candidates = ()
+    if choice is None:
+        choice, candidates = _choose(coarse, allow_none=lut == "auto")
+        log.info("look-up table: %s", choice)
+        if choice.kernel == "none":
+            return None, TableInfo(choice, candidates, None, np.nan)
+
+    bins = _Bins(coarse)
+    pilot = _pilot(bins, choice)
+    ny, nx = residual_map.image_shape
+    x_grid, y_grid = np.linspace(-0.5, nx - 0.5, n_grid), np.linspace(-0.5, ny - 0.5, n_grid)
+    sigma, chi2 = None, np.nan
+    if draft:
+        surface = pilot
+    else:
+        sigma, chi2 = _node_sigma(bins, pilot, choice, x_grid, y_grid)
+        fine = _Bins(residual_map)
+        surface = _interpolate(fine, fine.debiased(pilot), choice)
+    dx, dy = _fit_nodes(surface, bins, x_grid, y_grid)
+    return LookupTable(x_grid, y_grid, dx, dy, method=method), TableInfo(
+        choice, candidates, sigma, chi2
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class TableInfo:
+    """How a look-up table came about.
+
+    Parameters
+    ----------
+    choice : TableChoice
+        Settings used.
+    candidates : tuple of TableChoice
+        All that were compared by cross-validation, best first.
+    sigma : (3, n, n) ndarray or None
+        sigma_x and sigma_y in px and their correlation at the nodes.
+    chi2 : float
+        Reduced chi square of the bins about the table; near 1 where the errors of the stars are
+        right.
+    """
+
+    choice: TableChoice
+    candidates: tuple
+    sigma: np.ndarray | None
+    chi2: float
+
+
+def _assign_folds(maps):
+    """Sum of maps, each put into one group of the cross-validation in turn."""
+    maps = list(maps)
+    if not maps:
+        raise FitError("no residual map was given")
+    if len(maps) == 1:
+        return maps[0]
+    total = ResidualMap(maps[0].image_shape, shape=maps[0].shape)
+    for k, one in enumerate(maps):
+        moved = ResidualMap(one.image_shape, shape=one.shape)
+        moved.sums[k % N_FOLDS] = one.sums.sum(0)
+        total = total + moved
+    return total
+
+
+class _Bins:
+    """Occupied bins in normalised coordinates: centroids, means, variances, second moments."""
+
+    def __init__(self, residual_map):
+        total = residual_map.sums.sum(0)
+        occupied = total[0] > 0
+        t = total[:, occupied]
+        ny, nx = residual_map.image_shape
+        # Weighted sums over all groups but one may leave rounding errors, never negative counts.
+        self.half = 0.5 * max(ny, nx)
+        self.middle = np.array([0.5 * (nx - 1), 0.5 * (ny - 1)])
+        offset = t[2:4] / t[1]
+        centroid = offset + residual_map._centers()[:, occupied]
+        self.u, self.v = (centroid - self.middle[:, None]) / self.half
+        self.value = (t[7:9] / t[1]).T
+        self.weight = t[1]
+        # One variance serves both axes; how their noise differs is a property of the detector.
+        ratio = t[12:14].sum(1) / t[1].sum()
+        self.axis_scale = np.sqrt(ratio)
+        self.variance = 1.0 / t[1]
+        mxx = t[4] / t[1] - offset[0] ** 2
+        mxy = t[5] / t[1] - offset[0] * offset[1]
+        myy = t[6] / t[1] - offset[1] ** 2
+        self.moments = np.array([mxx, mxy, myy]) / self.half**2
+        self.count = t[0]
+
+    def __len__(self):
+        return len(self.u)
+
+    def debiased(self, pilot):
+        """Values at the centroids: means less the curvature of the pilot surface over each bin."""
+        return self.value - self.curvature(pilot)
+
+    def curvature(self, pilot):
+        """Half the trace of the pilot's Hessian times the second moments, ``(M, 2)``."""
+        h = 0.01
+        steps = ((0, 0), (h, 0), (-h, 0), (0, h), (0, -h), (h, h), (-h, -h), (h, -h), (-h, h))
+        f = [pilot(self.u + a, self.v + b) for a, b in steps]
+        xx = (f[1] + f[2] - 2 * f[0]) / h**2
+        yy = (f[3] + f[4] - 2 * f[0]) / h**2
+        xy = (f[5] + f[6] - f[7] - f[8]) / (4 * h**2)
+        mxx, mxy, myy = self.moments[:, :, None]
+        return 0.5 * (mxx * xx + 2 * mxy * xy + myy * yy)
+
+
+def _kernel(name, epsilon, u, v, u2, v2):
+    """Kernel matrix with the signs and scales of scipy's `RBFInterpolator`."""
+    square = (epsilon * (u[:, None] - u2)) ** 2
+    square += (epsilon * (v[:, None] - v2)) ** 2
+    if name == "gaussian":
+        return np.exp(np.negative(square, out=square), out=square)
+    if name == "quintic":
+        return -(square**2) * np.sqrt(square)
+    # thin plate spline: r^2 log r
+    return 0.5 * square * np.log(np.maximum(square, np.finfo(float).tiny))
+
+
+def _polynomials(u, v, degree):
+    """Products of Legendre polynomials up to a total degree, ``(N, p)``, lowest degrees first."""
+    a, b = legvander(u, degree), legvander(v, degree)
+    return np.stack(
+        [a[:, n - j] * b[:, j] for n in range(degree + 1) for j in range(n + 1)], axis=1
+    )
+
+
+def _n_terms(degree):
+    return (degree + 1) * (degree + 2) // 2
+
+
+class _Spectrum:
+    """One kernel diagonalised on the bins: cross-validation for all smoothings and degrees.
+
+    With D = diag(sigma), the smoother minimises |D^-1 (d - f)|^2 + s |f|^2 in the kernel's norm.
+    In the space orthogonal to the polynomials of the kernel's least degree, D^-1 K D^-1 = U L U^T;
+    polynomials of higher degree are added by generalised least squares.
+    """
+
+    def __init__(self, bins, value, kernel, epsilon, least_degree):
+        root = np.sqrt(bins.weight)
+        k = _kernel(kernel, epsilon, bins.u, bins.v, bins.u, bins.v)
+        k *= root[:, None]
+        k *= root
+        p = _n_terms(least_degree)
+        basis = _polynomials(bins.u, bins.v, _MAX_DEGREE) * root[:, None]
+        (reflectors, tau), _ = qr(basis[:, :p], mode="raw")
+        target = np.hstack([value * root[:, None], basis[:, p:]])
+
+        def rotate(matrix, side, transpose):
+            out, _, status = lapack.dormqr(
+                side, transpose, reflectors, tau, np.asfortranarray(matrix), 64 * max(matrix.shape)
+            )
+            return out
+
+        k = rotate(rotate(k, "L", "T"), "R", "N")[p:, p:]
+        target = rotate(target, "L", "T")[p:]
+        eigenvalues, vectors = eigh(k, overwrite_a=True, driver="evd", check_finite=False)
+        self.least_degree, self.n = least_degree, len(bins)
+        self.eigenvalues = np.maximum(eigenvalues, 0.0)
+        target = vectors.T @ target
+        self.target, self.basis = target[:, :2], target[:, 2:]
+
+    def scores(self, degree, smoothing):
+        """Generalised cross-validation and effective parameters of each smoothing."""
+        extra = self.basis[:, : _n_terms(degree) - _n_terms(self.least_degree)]
+        out = []
+        for s in smoothing:
+            g = s / (self.eigenvalues + s)  # residual of each mode without further polynomials
+            residual, trace = g[:, None] * self.target, g.sum()
+            if extra.shape[1]:
+                ge = g[:, None] * extra
+                normal = extra.T @ ge
+                solved = np.linalg.lstsq(
+                    normal, np.hstack([extra.T @ residual, ge.T @ ge]), rcond=1e-13
+                )[0]
+                residual = residual - ge @ solved[:, :2]
+                trace -= np.trace(solved[:, 2:])
+            out.append((np.sum(residual**2) * self.n / (2 * trace**2), self.n - trace))
+        return np.array(out).T
+
+
+def _smoothings(spectrum):
+    """Half-decade steps from barely to wholly smoothed."""
+    largest = spectrum.eigenvalues.max()
+    return largest * 10.0 ** np.arange(-10.0, 3.01, 0.5)
+
+
+def _choose(coarse, *, allow_none):
+    """Kernel, degree and smoothing by generalised cross-validation, then by groups of exposures."""
+    bins = _Bins(coarse)
+    # A first surface for the curvature within bins; it needs no more than the right order of
+    # magnitude.
+    spectrum = _Spectrum(bins, bins.value, "quintic", 1.0, 2)
+    first = _best_of(spectrum, "quintic", 1.0, bins)
+    value = bins.debiased(_pilot(bins, first[0]))
+
+    found = []
+    for kernel, epsilons, least_degree in _KERNELS:
+        for epsilon in epsilons:
+            spectrum = _Spectrum(bins, value, kernel, epsilon, least_degree)
+            found += _best_of(spectrum, kernel, epsilon, bins)
+    found.sort(key=lambda c: c.score)
+    shortlist = _distinct(found)
+    candidates = [TableChoice("none"), *shortlist]
+    scores = _cross_validate(coarse, candidates, first[0])
+    ranked = sorted(
+        (
+            TableChoice(c.kernel, c.degree, c.smoothing, c.epsilon, float(s), c.freedom)
+            for c, s in zip(candidates, scores)
+        ),
+        key=lambda c: c.score,
+    )
+    best = next(c for c in ranked if allow_none or c.kernel != "none")
+    return best, tuple(ranked)
+
+
+def _best_of(spectrum, kernel, epsilon, bins):
+    """Best smoothing of each degree, best first."""
+    found = []
+    smoothing = _smoothings(spectrum)
+    for degree in range(spectrum.least_degree, _MAX_DEGREE + 1):
+        if 2 * _n_terms(degree) > len(bins):
+            break
+        score, freedom = spectrum.scores(degree, smoothing)
+        # A smoother that follows nearly every bin has no residuals to be judged by.
+        score = np.where(freedom < 0.9 * len(bins), score, np.inf)
+        k = int(np.argmin(score))
+        found.append(
+            TableChoice(
+                kernel, degree, float(smoothing[k]), epsilon, float(score[k]), float(freedom[k])
+            )
+        )
+    return sorted(found, key=lambda c: c.score)
+
+
+def _distinct(found):
+    """Keep the best few of different kernels or lengths: neighbours in degree hardly differ."""
+    kept = {}
+    for c in found:
+        kept.setdefault((c.kernel, c.epsilon), c)
+    return list(kept.values())[:_N_SHORTLIST]
+
+
+def _cross_validate(coarse, candidates, first):
+    """Mean square normalised residual of left-out groups for each candidate."""
+    folds = coarse.folds
+    total = np.zeros(len(candidates))
+    if len(folds) < 2:
+        # One group alone: generalised cross-validation has the last word, and no table is judged by
+        # the raw means.
+        bins = _Bins(coarse)
+        raw = np.sum(bins.value**2 * bins.weight[:, None]) / (2 * len(bins))
+        return np.array([raw if c.kernel == "none" else c.score for c in candidates])
+    pilot = _pilot(_Bins(coarse), first)
+    n = 0
+    for fold in folds:
+        train, test = _Bins(coarse.without(fold)), _Bins(coarse.only(fold))
+        value, truth = train.debiased(pilot), test.debiased(pilot)
+        n += 2 * len(test)
+        for k, candidate in enumerate(candidates):
+            predicted = 0.0
+            if candidate.kernel != "none":
+                predicted = _solve(train, value, candidate)(test.u, test.v)
+            total[k] += np.sum((truth - predicted) ** 2 * test.weight[:, None])
+    return total / n
+
+
+def _saddle(bins, choice):
+    """Kernel matrix with smoothing, bordered by the polynomials."""
+    basis = _polynomials(bins.u, bins.v, choice.degree)
+    m, p = basis.shape
+    matrix = np.zeros((m + p, m + p))
+    matrix[:m, :m] = _kernel(choice.kernel, choice.epsilon, bins.u, bins.v, bins.u, bins.v)
+    matrix[np.arange(m), np.arange(m)] += choice.smoothing * bins.variance
+    matrix[:m, m:], matrix[m:, :m] = basis, basis.T
+    return matrix
+
+
+def _solve(bins, value, choice):
+    """Smoothed surface through the bins: a function of (u, v) that returns ``(N, 2)``."""
+    matrix = _saddle(bins, choice)
+    right = np.zeros((len(matrix), 2))
+    right[: len(bins)] = value
+    solution = np.linalg.solve(matrix, right)
+
+    def surface(u, v):
+        out = _polynomials(u, v, choice.degree) @ solution[len(bins) :]
+        return (
+            out
+            + _kernel(choice.kernel, choice.epsilon, u, v, bins.u, bins.v) @ solution[: len(bins)]
+        )
+
+    return surface
+
+
+def _pilot(bins, choice):
+    """Smooth surface on the coarse bins whose curvature corrects bin means, in two rounds."""
+    surface = _solve(bins, bins.value, choice)
+    return _solve(bins, bins.debiased(surface), choice)
+
+
+def _interpolate(bins, value, choice):
+    """Interpolate the final surface with scipy: a function of (u, v)."""
+    interpolator = RBFInterpolator(
+        np.stack([bins.u, bins.v], axis=1),
+        value,
+        kernel=choice.kernel,
+        degree=choice.degree,
+        epsilon=choice.epsilon,
+        smoothing=choice.smoothing * bins.variance,
+    )
+    return lambda u, v: interpolator(np.stack([u, v], axis=1))
+
+
+def _fit_nodes(surface, bins, x_grid, y_grid):
+    """Nodes whose cubic spline is closest to the surface, sampled twice as densely."""
+    grids = [(g - m) / bins.half for g, m in zip((x_grid, y_grid), bins.middle)]
+    fine = [np.linspace(g[0], g[-1], 2 * len(g) - 1) for g in grids]
+    u, v = np.meshgrid(*fine)
+    sampled = surface(u.ravel(), v.ravel()).reshape(*u.shape, 2)
+    # The spline is linear in its nodes: one pseudo-inverse per axis.
+    inverse = [np.linalg.pinv(CubicSpline(g, np.eye(len(g)))(f)) for g, f in zip(grids, fine)]
+    nodes = np.einsum("ia,jb,abk->kij", inverse[1], inverse[0], sampled, optimize=True)
+    return nodes
+
+
+def _node_sigma(bins, pilot, choice, x_grid, y_grid):
+    """Posterior sigma of the surface at the nodes without its linear part, and reduced chi2."""
+    matrix = _saddle(bins, choice)
+    m, p = len(bins), len(matrix) - len(bins)
+    u, v = (
+        a.ravel()
+        for a in np.meshgrid(*((g - c) / bins.half for g, c in zip((x_grid, y_grid), bins.middle)))
+    )
+    cross = np.zeros((m + p, len(u)))
+    cross[:m] = _kernel(choice.kernel, choice.epsilon, bins.u, bins.v, u, v)
+    cross[m:] = _polynomials(u, v, choice.degree).T
+    right = np.zeros((m + p, 2))
+    right[:m] = bins.debiased(pilot)
+    solved = np.linalg.solve(matrix, np.hstack([cross, right, np.eye(m + p, m)]))
+    fit = right[:m] - (choice.smoothing * bins.variance)[:, None] * solved[:m, len(u) : len(u) + 2]
+    freedom = m - choice.smoothing * np.sum(bins.variance * np.diagonal(solved[:m, len(u) + 2 :]))
+    residual = (right[:m] - fit) ** 2 * bins.weight[:, None]
+    chi2 = float(residual.sum() / (2 * max(m - freedom, 1.0)))
+    solved = solved[:, : len(u)]
+
+    def apply(vectors):
+        prior = _kernel(choice.kernel, choice.epsilon, u, v, u, v) @ vectors
+        return (prior - cross.T @ (solved @ vectors)) / choice.smoothing
+
+    diagonal = np.diagonal(_kernel(choice.kernel, choice.epsilon, u[:1], v[:1], u[:1], v[:1]))
+    variance = (diagonal - np.einsum("ij,ij->j", cross, solved)) / choice.smoothing
+    linear = np.linalg.qr(np.stack([np.ones_like(u), u, v], axis=1))[0]
+    image = apply(linear)
+    variance -= 2 * np.einsum("ij,ij->i", image, linear)
+    variance += np.einsum("ij,jk,ik->i", linear, linear.T @ image, linear)
+    sigma = np.sqrt(np.maximum(variance, 0.0) * max(chi2, 0.25)).reshape(len(y_grid), len(x_grid))
+    return np.array(
+        [sigma * bins.axis_scale[0], sigma * bins.axis_scale[1], np.zeros_like(sigma)]
+    ), chi2
