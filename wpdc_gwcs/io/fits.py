@@ -32,7 +32,7 @@ from wpdc_gwcs.io.headers import (
     parse_tan,
     split_extension,
 )
-from wpdc_gwcs.models import LookupTable, project
+from wpdc_gwcs.models import LookupTable, PVPolynomial, project
 from wpdc_gwcs.solution import Calibration, DistortionSolution
 
 __all__ = [
@@ -46,6 +46,7 @@ __all__ = [
 ]
 
 _TABLE_NAME = "WPDC_LUT"
+_INSTRUMENT_NAME = "WPDC_INSTRUMENT"
 _TABLE_COLUMNS = ("X_GRID", "Y_GRID", "DX_LUT", "DY_LUT")
 _FORMAT_VERSION = "1.0"
 _CPDIS_TOLERANCE = 5e-4  # px, aimed at; 1e-3 is promised
@@ -69,11 +70,13 @@ def write_fits(obj, path, *, overwrite=False):
     -----
     ``WPDC_LUT`` has one row for each node, x running fastest: ``X_GRID``, ``Y_GRID`` in FITS pixels
     (from one) and ``DX_LUT``, ``DY_LUT``, px, to be subtracted from the undistorted position.  The
-    attitude of the exposure is folded into the polynomial, ``PV(U) = A PV0(A^-1 U)`` with ``A = CD
-    CD0^-1``.
+    attitude of the exposure is folded into the polynomial, ``PV(U) = A PV0(A^-1 U)``, where
+    ``A = CD CD0^-1``.  The one row of ``WPDC_INSTRUMENT`` has CD0, PV0, the zero-based CRPIX and
+    the nominal CRVAL as they are, so that what is read back is the same to the last bit.
     """
-    hdus = [fits.PrimaryHDU(header=tpv_header(obj))]
-    table = _parts(obj)[0].lookup_table
+    solution = _parts(obj)[0]
+    hdus = [fits.PrimaryHDU(header=tpv_header(obj)), _instrument_hdu(solution)]
+    table = solution.lookup_table
     if table is not None:
         x, y = np.meshgrid(table.x_grid + 1.0, table.y_grid + 1.0)
         values = (x, y, table.dx, table.dy)
@@ -110,7 +113,7 @@ def read_fits(path):
         If the file is damaged, has no such header or more than one.
     """
     path, extension = split_extension(path)
-    table, number, name = None, 0, str(path)
+    table, instrument, number, name = None, None, 0, str(path)
     if file_kind(path) == "fits":
         with open_fits(path) as hdus:
             if extension is not None:
@@ -121,6 +124,8 @@ def read_fits(path):
             several = len(hdus) > 1
             if _TABLE_NAME in hdus:
                 table = _read_table(hdus[_TABLE_NAME], f"{path}[{_TABLE_NAME}]")
+            if _INSTRUMENT_NAME in hdus:
+                instrument = _read_instrument(hdus[_INSTRUMENT_NAME], f"{path}[{_INSTRUMENT_NAME}]")
         if several and extension is not None:
             name = f"{path}[{extension}]"
     else:
@@ -138,14 +143,13 @@ def read_fits(path):
             f"{name}: projection must be TAN or TPV to be a calibration, "
             f"got {header_text(header, 'CTYPE1')!r}; as a starting WCS it can be read"
         )
+    if instrument is None or not _agree(instrument, tan):
+        instrument = {"crpix": tan.crpix, "cd": tan.cd, "crval": tan.crval, "pv": tan.pv}
     solution = DistortionSolution(
         detector=header_text(header, "DETECTOR") or header_text(header, "EXTNAME") or "detector",
         image_shape=tan.image_shape,
-        crpix=tan.crpix,
-        cd=tan.cd,
-        crval=tan.crval,
-        pv=tan.pv,
         lookup_table=table,
+        **instrument,
         provenance={"file": str(path)},
     )
     frame = header_text(header, "FRAME") or stem_of(path)
@@ -185,10 +189,7 @@ def write_cpdis(obj, path, *, overwrite=False):
     solution = _parts(obj)[0]
     _require_shape(obj)
     table = solution.lookup_table
-    if table is None:
-        hdus = [fits.PrimaryHDU(header=header)]
-        worst = deviation(obj, _astropy_sky(hdus))
-    factor, worst = 1, np.inf
+    hdus, worst, factor = [fits.PrimaryHDU(header=header)], np.inf, 1
     while table is not None and worst > _CPDIS_TOLERANCE:
         grids = [
             np.linspace(g[0], g[-1], (len(g) - 1) * factor + 1)
@@ -263,22 +264,23 @@ def write_sip(obj, path, *, overwrite=False, degree=None):
     ones go into CD, and CRPIX moves to where the sky is CRVAL.
     """
     _require_shape(obj)
-    degrees = _SIP_DEGREES if degree is None else [degree]
     if degree is not None and degree not in _SIP_DEGREES:
         raise ValueError(f"degree must be from 2 to 9, got {degree}")
-    fits_ = []
-    for n in degrees:
-        header, inverse_error = _sip_header(obj, n)
-        worst = deviation(obj, _astropy_sky([fits.PrimaryHDU(header=header)]))
-        fits_.append((worst, inverse_error, header))
+    samples = _sip_samples(obj)
+    trials = []
+    for n in _SIP_DEGREES if degree is None else [degree]:
+        header, inverse = _sip_header(obj, samples, n)
+        worst = deviation(obj, _astropy_sky([fits.PrimaryHDU(header=header)]), n=151)
+        trials.append((worst, header, inverse))
         if worst < 1e-4:
             break
-    best = min(f[0] for f in fits_)
-    worst, inverse_error, header = next(f for f in fits_ if f[0] <= 1.1 * best)
+    best = min(trial[0] for trial in trials)
+    _, header, inverse = next(trial for trial in trials if trial[0] <= 1.1 * best)
+    worst = deviation(obj, _astropy_sky([fits.PrimaryHDU(header=header)]))
     _add_history(
         header,
         f"greatest deviation of the SIP approximation: {worst:.3g} px, "
-        f"of its inverse polynomials (AP, BP): {inverse_error:.3g} px",
+        f"of its inverse polynomials (AP, BP): {inverse:.3g} px",
     )
     _write_hdus([fits.PrimaryHDU(header=header)], path, overwrite)
     return worst
@@ -331,8 +333,8 @@ def deviation(obj, sky, *, n=401):
     exact = np.array(obj.wcs.get_transform("detector", "undistorted")(x, y))
     plane = np.array(project(*sky(x, y), crval))
     other = np.linalg.solve(cd, plane) + np.asarray(solution.crpix)[:, None]
-    distance = np.hypot(*(other - exact))
-    return float(np.where(np.isfinite(distance), distance, np.inf).max())
+    distance = np.hypot(*(other - exact))[np.isfinite(exact).all(axis=0)]
+    return float(np.where(np.isfinite(distance), distance, np.inf).max(initial=0.0))
 
 
 def obj_shape(obj):
@@ -415,12 +417,62 @@ def _read_table(hdu, name):
             f"{name}: nodes must be a full grid with x running fastest, got {len(x)} rows with "
             f"{shape[1]} values of X_GRID and {shape[0]} of Y_GRID"
         )
+    # From one to zero; where the nodes are spaced as evenly as they can, so that they are again.
+    grids = []
+    for grid in (x_grid - 1.0, y_grid - 1.0):
+        even = np.linspace(grid[0], grid[-1], len(grid))
+        grids.append(even if np.allclose(grid, even, rtol=0, atol=1e-9) else grid)
     try:
-        return LookupTable(
-            x_grid - 1.0, y_grid - 1.0, dx.reshape(shape), dy.reshape(shape), method=method
-        )
+        return LookupTable(*grids, dx.reshape(shape), dy.reshape(shape), method=method)
     except ValueError as problem:
         raise FileFormatError(f"{name}: {first_line(problem)}") from problem
+
+
+def _instrument_hdu(solution):
+    pv = solution.pv
+    values = {
+        "CRPIX": ("2D", "pixel", solution.crpix),
+        "CD": ("4D", "deg/pixel", solution.cd),
+        "CRVAL": ("2D", "deg", solution.crval),
+        "DEGREE": ("1J", "", pv.degree),
+        "RADIAL": ("1L", "", pv.radial),
+        "PV": (f"{pv.coefficients.size}D", "deg", pv.coefficients),
+    }
+    hdu = fits.BinTableHDU.from_columns(
+        [
+            fits.Column(name, form, unit=unit or None, array=np.asarray(value).reshape(1, -1))
+            for name, (form, unit, value) in values.items()
+        ],
+        name=_INSTRUMENT_NAME,
+    )
+    hdu.header.add_comment("CRPIX counts from zero; PV: axis 1, then axis 2, by FITS index")
+    return hdu
+
+
+def _read_instrument(hdu, name):
+    try:
+        row = {c: np.array(hdu.data[c][0]) for c in hdu.columns.names}
+        return {
+            "crpix": row["CRPIX"].astype(float),
+            "cd": row["CD"].astype(float).reshape(2, 2),
+            "crval": row["CRVAL"].astype(float),
+            "pv": PVPolynomial.from_coefficients(
+                row["PV"].astype(float).reshape(2, -1),
+                degree=int(row["DEGREE"]),
+                radial=bool(row["RADIAL"]),
+            ),
+        }
+    except READ_ERRORS as problem:
+        raise FileFormatError(f"{name}: damaged table: {first_line(problem)}") from problem
+
+
+def _agree(instrument, tan):
+    """Tell whether the keywords still say what the instrument says: they may have been edited."""
+    if instrument["pv"].degree != tan.pv.degree or instrument["pv"].radial != tan.pv.radial:
+        return False
+    folded = fold_attitude(instrument["pv"], _relative(tan.cd, instrument["cd"]))
+    same = np.allclose(folded.coefficients, tan.pv.coefficients, rtol=1e-9, atol=1e-13)
+    return same and np.allclose(instrument["crpix"], tan.crpix, rtol=0, atol=1e-9)
 
 
 def _number_card(keyword, value, comment=""):
@@ -541,28 +593,33 @@ def _cpdis_hdus(header, grids, shift):
     return [fits.PrimaryHDU(header=header), *images]
 
 
-def _sip_header(obj, degree):
-    """Give a SIP approximation of one degree, and the error of its inverse polynomials in px."""
-    solution, cd, crval, _ = _parts(obj)
+def _sip_samples(obj):
+    """Give pixels and their plane coordinates (deg) for a fit."""
+    solution, cd, _, _ = _parts(obj)
     ny, nx = solution.image_shape
     # Chebyshev points make least squares nearly the best approximation in the greatest error.
-    t = np.cos(np.pi * (np.arange(96) + 0.5) / 96)
+    t = np.cos(np.pi * (np.arange(64) + 0.5) / 64)
     x, y = np.meshgrid(0.5 * (nx - 1) + 0.5 * nx * t, 0.5 * (ny - 1) + 0.5 * ny * t)
     x, y = x.ravel(), y.ravel()
     undistorted = np.array(obj.wcs.get_transform("detector", "undistorted")(x, y))
-    plane = cd @ (undistorted - np.asarray(solution.crpix)[:, None])
-    scale = 0.5 * max(nx, ny)
+    return np.array([x, y]), cd @ (undistorted - np.asarray(solution.crpix)[:, None])
+
+
+def _sip_header(obj, samples, degree):
+    """Give a SIP approximation of one degree, and the error of its inverse polynomials in px."""
+    pixels, plane = samples
+    center = pixels.mean(axis=1)
+    scale = np.abs(pixels - center[:, None]).max()
     # Where the fit meets CRVAL: the reference pixel of a form without constant terms.
-    center = np.array([0.5 * (nx - 1), 0.5 * (ny - 1)])
-    c = _fit_terms(x - center[0], y - center[1], plane, scale, degree, least=0)
-    crpix = center + _root(c, np.linalg.solve(cd, -plane.mean(axis=1)))
-    c = _fit_terms(x - crpix[0], y - crpix[1], plane, scale, degree, least=1)
+    c = _fit_terms(*(pixels - center[:, None]), plane, scale, degree, least=0)
+    crpix = center + _root(c)
+    u = pixels - crpix[:, None]
+    c = _fit_terms(*u, plane, scale, degree, least=1)
     linear = np.column_stack([c[:, 1, 0], c[:, 0, 1]])
     forward = np.einsum("ij,jpq->ipq", np.linalg.inv(linear), c)
-    u = np.array([x, y]) - crpix[:, None]
     w = np.linalg.solve(linear, plane)
     inverse = _fit_terms(*w, u - w, np.abs(w).max(), degree, least=0)
-    header = _linear_header(obj, "TAN-SIP", crpix, linear, crval)
+    header = _linear_header(obj, "TAN-SIP", crpix, linear, _parts(obj)[2])
     for tag, terms, least in (("", forward, 2), ("P", inverse, 0)):
         for axis, letter in enumerate("AB"):
             header[f"{letter}{tag}_ORDER"] = (degree, "degree of the polynomial")
@@ -588,9 +645,9 @@ def _fit_terms(u, v, values, scale, degree, *, least):
     return terms
 
 
-def _root(terms, start):
-    """Where a fitted polynomial map is zero."""
-    z = np.array(start, float)
+def _root(terms):
+    """Find where a fitted polynomial map is zero."""
+    z = -np.linalg.solve(np.column_stack([terms[:, 1, 0], terms[:, 0, 1]]), terms[:, 0, 0])
     for _ in range(50):
         value = np.array([polynomial.polyval2d(*z, c) for c in terms])
         jacobian = np.array(
