@@ -85,14 +85,19 @@ def evaluate_blocks(function, *inputs, n_outputs=2):
     shape = inputs[0].shape
     flat = [value.reshape(-1) for value in inputs]
     size = flat[0].size
+
+    def call(start, stop):
+        blocks = [np.ascontiguousarray(value[start:stop], dtype=np.float64) for value in flat]
+        # Infinite and absurd coordinates become NaN; that is the answer, not an accident.
+        with np.errstate(all="ignore"):
+            return function(*blocks)
+
     if size <= BLOCK_SIZE:
-        blocks = [np.ascontiguousarray(value, dtype=np.float64) for value in flat]
-        return tuple(value.reshape(shape) for value in function(*blocks))
+        return tuple(value.reshape(shape) for value in call(0, size))
     outputs = [np.empty(size) for _ in range(n_outputs)]
 
     def run(start, stop):
-        blocks = [np.ascontiguousarray(value[start:stop], dtype=np.float64) for value in flat]
-        for output, block in zip(outputs, function(*blocks), strict=True):
+        for output, block in zip(outputs, call(start, stop), strict=True):
             output[start:stop] = block
 
     run_blocks(run, size)

@@ -269,8 +269,8 @@ class DistortionInverse(Model):
 
     @property
     def inverse(self):
-        """The model from detector to undistorted pixels."""
-        return self.distortion
+        """The model from detector to undistorted pixels (a copy)."""
+        return self.distortion.copy()
 
 
 class DetectorToSky(Model):

@@ -3,6 +3,7 @@
 import numpy as np
 from astropy.modeling import FittableModel, Model
 from astropy.modeling.parameters import Parameter
+from astropy.units import Quantity
 
 from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.models.mapping import PlaneMap, expand_pv
@@ -37,7 +38,7 @@ class PVPolynomial(FittableModel):
     ValueError
         If the degree is not an integer from 1 to 7.
     TypeError
-        If a coefficient does not exist at this degree.
+        If a coefficient does not exist at this degree or is not a plain number.
 
     Notes
     -----
@@ -85,6 +86,10 @@ class PVPolynomial(FittableModel):
                 f"a PV polynomial of degree {degree} {'with' if radial else 'without'} radial "
                 f"terms has no parameter {sorted(unknown)[0]!r}"
             )
+        for parameter_name in set(parameters).intersection(names):
+            value = parameters[parameter_name]
+            if isinstance(value, Quantity) or np.ndim(value):
+                raise TypeError(f"{parameter_name} must be a plain number, not {value!r}")
         self._param_names = names
         for parameter_name in names:
             parameter = Parameter(parameter_name, default=float(parameter_name.endswith("_1")))
@@ -286,5 +291,5 @@ class PVInverse(Model):
 
     @property
     def inverse(self):
-        """The polynomial."""
-        return self.polynomial
+        """The polynomial (a copy)."""
+        return self.polynomial.copy()
