@@ -24,6 +24,8 @@ __all__ = [
 # Widths of the coincidence box in (log d, theta): from fine to coarse, the data pick (adaptive
 # threshold).
 BOX_WIDTHS = (0.02, 0.04, 0.08)
+# An agreement this surprising (decimal logarithm) makes a hypothesis member of a group.
+_LEAST_WORTH = 1.0
 # Differences held in memory at a time.
 _CHUNK = 6_000_000
 N_NEIGHBOURS = 12
@@ -103,7 +105,7 @@ class Hypotheses:
     count, expected : (n,) ndarray
         Neighbours that coincide and how many would by chance.
     surprise : (n,) ndarray
-        Minus the decimal logarithm of the probability to see so many by chance.
+        Minus the decimal logarithm of the probability that a wrong candidate looks so good.
     width : (n,) ndarray
         Width of the coincidence box.
     """
@@ -198,6 +200,11 @@ def compare_patterns(
     order = np.lexsort((-surprise, anchor_of))
     first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     rank = np.arange(len(order)) - np.repeat(first, sizes)
+    # A star is one reference star at most, so second-best candidates are wrong and show how far
+    # chance goes among so many: make 10**-surprise the probability for a single wrong candidate.
+    second = surprise[order[(rank == 1)]]
+    if len(second):
+        surprise = surprise - max(0.0, np.median(second) - np.log10(np.median(sizes) / 2 + 1))
     order = order[(rank < per_anchor) & (surprise[order] > 0)]
     order = order[np.argsort(-surprise[order], kind="stable")]
     return Hypotheses(
@@ -265,7 +272,17 @@ def _coincidences(log_s, angle_s, log_r, angle_r, max_log_scale, max_rotation):
     return best
 
 
-def select_coherent(hypotheses, sources, reference, *, curvature, density, max_seeds=8, most=500):
+def select_coherent(
+    hypotheses,
+    sources,
+    reference,
+    *,
+    curvature,
+    density,
+    max_difference,
+    max_seeds=8,
+    most=500,
+):
     """Find groups of hypotheses that tell one story.
 
     Two hypotheses agree when the local scale and rotation of one predict where the other one's
@@ -283,6 +300,8 @@ def select_coherent(hypotheses, sources, reference, *, curvature, density, max_s
         Largest second derivative of the distortion, 1/px.
     density : float
         Reference stars per square pixel, which says how often two agree by chance.
+    max_difference : float
+        Largest difference of scale and rotation that was allowed.
     max_seeds : int
         Groups to return.
     most : int
@@ -315,9 +334,10 @@ def select_coherent(hypotheses, sources, reference, *, curvature, density, max_s
         & (np.abs(h.log_scale[:, None] - h.log_scale[None]) <= slack)
         & (np.abs(h.rotation[:, None] - h.rotation[None]) <= slack)
     )
-    # an agreement is worth what is left of the other's surprise after the number of stars it could
-    # have picked
-    worth = h.surprise[None] - 1.0 - np.log10(1 + density * np.pi * tolerance**2)
+    # an agreement is worth what is left of the other's surprise after all the stars among which it
+    # could have been picked; scale and rotation must fit as well
+    share = np.minimum(1.0, (slack / max_difference) ** 2)
+    worth = h.surprise[None] - np.log10((1 + density * np.pi * tolerance**2) * share)
     worth = np.where(agree & (h.source[:, None] != h.source[None]), np.maximum(worth, 0.0), 0.0)
     np.fill_diagonal(worth, h.surprise)
     # a source counts once in a group: its best hypothesis there
@@ -328,7 +348,7 @@ def select_coherent(hypotheses, sources, reference, *, curvature, density, max_s
     for seed in np.argsort(-support, kind="stable"):
         if taken[seed]:
             continue
-        members = np.flatnonzero(worth[seed] > 0)
+        members = np.flatnonzero(worth[seed] > _LEAST_WORTH)
         members = members[np.argsort(-worth[seed, members], kind="stable")]
         _, once = np.unique(h.source[members], return_index=True)
         members = members[np.sort(once)]

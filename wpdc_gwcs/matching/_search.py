@@ -219,6 +219,7 @@ class Search:
             reference.points,
             curvature=limits.curvature,
             density=len(reference.points) / area,
+            max_difference=limits.max_scale + limits.gradient,
         )
         return hypotheses, groups
 
