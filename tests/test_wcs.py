@@ -1,0 +1,480 @@
+"""The WCS: pipeline, inverse, interface, its stock form, whole images."""
+
+import copy
+import pickle
+import tracemalloc
+
+import asdf
+import gwcs
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.modeling.models import Identity, Shift
+from astropy.wcs import WCS
+from astropy.wcs.wcsapi import HighLevelWCSWrapper, SlicedLowLevelWCS
+from gwcs import coordinate_frames as cf
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from wpdc_gwcs.models import (
+    DetectorToSky,
+    DistortionCorrection,
+    LookupTable,
+    PVPolynomial,
+    TangentSky,
+    project,
+    pv_terms,
+)
+from wpdc_gwcs.wcs import DetectorWCS, build_wcs, sky_map, to_stock_wcs
+
+NX, NY = 9216, 9232
+SCALE = 0.074 / 3600
+CRPIX = (4607.5, 4615.5)
+
+
+def rotation(angle):
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    return np.array([[c, -s], [s, c]])
+
+
+def camera_wcs(
+    crval=(120.0, 30.0),
+    roll=0.0,
+    *,
+    table="cubic",
+    corner=200.0,
+    shape=(NY, NX),
+    pv_cd=None,
+    seed=3,
+):
+    """A camera with a distortion of `corner` px at its corners and a wavy table."""
+    rng = np.random.default_rng(seed)
+    ny, nx = shape
+    scale = SCALE * NX / nx
+    cd0 = scale * np.array([[-1.0, 0.0], [0.0, 1.0]])
+    half = scale * nx / 2
+    terms = pv_terms(3)
+    coefficients = rng.normal(size=(2, len(terms.index)))
+    coefficients /= half ** (terms.own + terms.other - 1.0)
+    coefficients[:, terms.own + terms.other < 2] = 0.0
+    pv = PVPolynomial.from_coefficients(coefficients)
+    corners = half * np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]])
+    coefficients *= corner * scale / np.hypot(*pv(*corners)).max()
+    coefficients[:, 1] += 1.0
+    if table is not None:
+        x, y = np.linspace(-0.5, nx - 0.5, 50), np.linspace(-0.5, ny - 0.5, 50)
+        gx, gy = np.meshgrid(x / nx, y / ny)
+        dx = 0.1 * np.sin(25 * gx + 3 * gy) + 2 * (gx - 0.5) ** 4
+        dy = 0.1 * np.cos(28 * gy - 9 * gx) - 3 * (gy - 0.5) ** 4
+        table = LookupTable(x, y, dx, dy, method=table)
+    return build_wcs(
+        crpix=((nx - 1) / 2, (ny - 1) / 2),
+        cd=cd0 @ rotation(roll) if pv_cd is None else pv_cd @ rotation(roll),
+        pv_cd=cd0,
+        crval=crval,
+        pv=PVPolynomial.from_coefficients(coefficients),
+        lookup_table=table,
+        image_shape=shape,
+    )
+
+
+def detector_points(rng, n=2000, shape=(NY, NX)):
+    """Points all over a detector, rim and corners included."""
+    ny, nx = shape
+    x, y = rng.uniform(-0.5, nx - 0.5, n), rng.uniform(-0.5, ny - 0.5, n)
+    low, right, top = np.full(50, -0.5), np.full(50, nx - 0.5), np.full(50, ny - 0.5)
+    ex, ey = np.linspace(-0.5, nx - 0.5, 50), np.linspace(-0.5, ny - 0.5, 50)
+    x = np.concatenate([x, ex, ex, low, right])
+    y = np.concatenate([y, low, top, ey, ey])
+    return x, y
+
+
+POINTINGS = [
+    (0.0, 0.0),
+    (120.0, 30.0),
+    (359.9999, -45.0),
+    (0.0, 89.9),
+    (77.0, 90.0),
+    (10.0, -90.0),
+    (200.0, -89.97),
+]
+
+
+# --- pipeline
+
+
+def test_pipeline_frames_and_shape():
+    wcs = camera_wcs()
+    assert isinstance(wcs, gwcs.WCS)
+    assert wcs.available_frames == ["detector", "undistorted", "icrs"]
+    assert wcs.pixel_shape == (NX, NY)
+    assert wcs.array_shape == (NY, NX)
+    assert wcs.pixel_bounds == ((-0.5, NX - 0.5), (-0.5, NY - 0.5))
+    assert isinstance(wcs.get_transform("detector", "undistorted"), DistortionCorrection)
+    assert isinstance(wcs.get_transform("undistorted", "icrs"), TangentSky)
+    assert isinstance(wcs.forward_transform, DetectorToSky)
+
+
+@pytest.mark.parametrize("table", [None, "linear", "cubic"])
+def test_forward_is_the_equation(table, rng):
+    wcs = camera_wcs(table=table, roll=20.0)
+    distortion, sky = (step.transform for step in wcs.pipeline[:-1])
+    x, y = rng.uniform(0, 9000, (2, 500))
+    # The equation with matrices of numpy and the polynomial and TAN of wcslib.
+    cd0, cd, crpix = distortion.cd.value, sky.cd.value, np.reshape(CRPIX, (2, 1))
+    shift = 0.0 if table is None else np.array(distortion.lookup_table(x, y))
+    undistorted = np.linalg.inv(cd0) @ np.array(distortion.pv(*(cd0 @ ([x, y] - crpix)))) - shift
+    tan = WCS(naxis=2)
+    tan.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    tan.wcs.crval, tan.wcs.crpix, tan.wcs.cd = [120.0, 30.0], np.add(CRPIX, 1), cd
+    expected = tan.wcs_pix2world(*(undistorted + crpix), 0)
+    assert_allclose(wcs(x, y), expected, rtol=0, atol=1e-12)
+    steps = wcs.get_transform("undistorted", "icrs")(
+        *wcs.get_transform("detector", "undistorted")(x, y)
+    )
+    assert_allclose(wcs(x, y), steps, rtol=0, atol=1e-12)
+    assert_allclose(wcs.get_transform("detector", "icrs")(x, y), expected, rtol=0, atol=1e-12)
+
+
+def test_polynomial_alone_is_a_tpv_header(rng):
+    wcs = camera_wcs(table=None)
+    distortion, sky = (step.transform for step in wcs.pipeline[:-1])
+    tpv = WCS(naxis=2)
+    tpv.wcs.ctype = ["RA---TPV", "DEC--TPV"]
+    tpv.wcs.crval, tpv.wcs.crpix, tpv.wcs.cd = sky.crval.value, np.add(CRPIX, 1), sky.cd.value
+    pv = distortion.pv
+    tpv.wcs.set_pv(
+        [
+            (i + 1, int(j), pv.coefficients[i, k])
+            for i in (0, 1)
+            for k, j in enumerate(pv.term_indices)
+        ]
+    )
+    x, y = detector_points(rng)
+    assert_allclose(wcs(x, y), tpv.wcs_pix2world(x, y, 0), rtol=0, atol=1e-12)
+
+
+# --- inverse
+
+
+@pytest.mark.parametrize("roll", [0.0, 33.0, 90.0, -147.0])
+@pytest.mark.parametrize("crval", POINTINGS)
+def test_round_trip_everywhere(crval, roll, rng):
+    wcs = camera_wcs(crval, roll)
+    x, y = detector_points(rng)
+    sky = wcs(x, y)
+    assert np.all(np.isfinite(sky))
+    for found in (
+        wcs.invert(*sky),
+        wcs.world_to_pixel_values(*sky),
+        wcs.world_to_pixel(wcs.pixel_to_world(x, y)),
+        wcs.get_transform("icrs", "detector")(*sky),
+        wcs.invert(*sky, with_bounding_box=False),
+        wcs.invert(sky[0] - 360.0, sky[1]),
+    ):
+        # Right ascension resolves 6e-14 deg at 360 deg, 3e-9 px here.
+        assert_allclose(found, (x, y), rtol=0, atol=2e-8)
+
+
+@pytest.mark.parametrize("table", [None, "linear", "cubic"])
+def test_round_trip_without_and_with_a_table(table, rng):
+    wcs = camera_wcs((5.0, 89.99), 45.0, table=table)
+    x, y = detector_points(rng)
+    assert_allclose(wcs.invert(*wcs(x, y)), (x, y), rtol=0, atol=2e-8)
+
+
+@given(
+    ra=st.floats(0, 360),
+    dec=st.floats(-90, 90),
+    roll=st.floats(0, 360),
+    corner=st.floats(0.01, 220),
+    seed=st.integers(0, 1000),
+)
+@settings(deadline=None, max_examples=40)
+def test_round_trip_of_any_pointing(ra, dec, roll, corner, seed):
+    wcs = camera_wcs((ra, dec), roll, corner=corner, seed=seed)
+    x, y = detector_points(np.random.default_rng(seed), 200)
+    assert_allclose(wcs.invert(*wcs(x, y)), (x, y), rtol=0, atol=1e-7)
+
+
+def test_attitude_far_from_the_nominal_one(rng):
+    """The exposure's matrix may differ from the instrument's by degrees and per cents."""
+    stretched = SCALE * np.array([[-1.03, 0.01], [0.02, 0.97]])
+    wcs = camera_wcs((30.0, -20.0), 5.0, pv_cd=stretched)
+    x, y = detector_points(rng)
+    assert_allclose(wcs.invert(*wcs(x, y)), (x, y), rtol=0, atol=2e-8)
+
+
+def test_outside_is_nan_and_never_a_number(rng):
+    wcs = camera_wcs((0.0, 89.9))
+    assert np.all(np.isnan(wcs(-0.6, 10.0)))
+    assert np.all(np.isnan(wcs(10.0, NY - 0.4)))
+    assert wcs(-5.0, 3.0, fill_value=-1.0) == (-1.0, -1.0)
+    x, y = detector_points(rng)
+    outward = 1.0 + 10.0 / NX
+    ra, dec = camera_wcs((0.0, 89.9), table=None)(
+        CRPIX[0] + outward * (x[-200:] - CRPIX[0]),
+        CRPIX[1] + outward * (y[-200:] - CRPIX[1]),
+        with_bounding_box=False,
+    )
+    assert np.all(np.isfinite(ra))
+    assert np.all(np.isnan(wcs.invert(ra, dec)))
+    # All over the sky: whatever comes back maps to where it was asked for.
+    ra, dec = rng.uniform(0, 360, 5000), np.degrees(np.arcsin(rng.uniform(-1, 1, 5000)))
+    ra[:2000], dec[:2000] = rng.uniform(0, 360, 2000), rng.uniform(89.0, 90.0, 2000)
+    x, y = wcs.invert(ra, dec)
+    found = np.isfinite(x)
+    assert 50 < np.count_nonzero(found) < 1000
+    assert np.array_equal(found, np.isfinite(y))
+    back = project(*wcs(x[found], y[found]), (0.0, 89.9))
+    assert_allclose(back, project(ra[found], dec[found], (0.0, 89.9)), rtol=0, atol=1e-12)
+    # And none is missing: the undistorted position is on the detector where it was found.
+    assert np.all(np.isnan(wcs.invert([np.nan, 0.0, np.inf], [0.0, np.nan, 0.0])))
+
+
+def test_inverse_masks_both_coordinates_and_fills():
+    wcs = camera_wcs(table=None)
+    sky = wcs(-20.0, 100.0, with_bounding_box=False)
+    assert np.all(np.isnan(wcs.invert(*sky)))
+    assert wcs.invert(*sky, fill_value=-9.0) == (-9.0, -9.0)
+    assert_allclose(wcs.invert(*sky, with_bounding_box=False), (-20.0, 100.0), atol=1e-8)
+    assert wcs.in_image(*wcs(5.0, 5.0))
+    assert not wcs.in_image(*sky)
+
+
+def test_scalar_and_array_calls_agree(rng):
+    wcs = camera_wcs()
+    x, y = rng.uniform(0, 9000, (2, 20))
+    sky = np.array(wcs(x, y))
+    pixels = np.array(wcs.invert(*sky))
+    for k in range(20):
+        assert_allclose(wcs(x[k], y[k]), sky[:, k], rtol=1e-15)
+        assert_allclose(wcs.invert(*sky[:, k]), pixels[:, k], rtol=1e-14)
+    assert_allclose(wcs(*(v.reshape(4, 5) for v in (x, y))), sky.reshape(2, 4, 5), rtol=1e-15)
+    assert [v.shape for v in wcs(np.zeros(0), np.zeros(0))] == [(0,)] * 2
+    assert [v.shape for v in wcs.invert(np.zeros(0), np.zeros(0))] == [(0,)] * 2
+    assert [np.ndim(v) for v in (*wcs(1, 2), *wcs.invert(*wcs(1, 2)))] == [0] * 4
+
+
+# --- the shared interface, as gwcs tests its own
+
+
+def test_low_level_interface():
+    wcs = camera_wcs()
+    assert (wcs.pixel_n_dim, wcs.world_n_dim) == (2, 2)
+    assert tuple(wcs.world_axis_physical_types) == ("pos.eq.ra", "pos.eq.dec")
+    assert tuple(wcs.world_axis_units) == ("deg", "deg")
+    assert tuple(wcs.pixel_axis_names) == ("x", "y")
+    assert wcs.axis_correlation_matrix.tolist() == [[True, True], [True, True]]
+    assert wcs.world_axis_object_components[0][:2] == ("celestial", 0)
+    assert wcs.world_axis_object_classes["celestial"][0] is SkyCoord
+    assert not wcs.serialized_classes
+    assert_allclose(wcs.pixel_to_world_values(10, 20), wcs(10, 20), rtol=0)
+    assert_allclose(wcs.array_index_to_world_values(20, 10), wcs(10, 20), rtol=0)
+    assert wcs.world_to_array_index_values(*wcs(10, 20)) == (20, 10)
+
+
+def test_high_level_interface():
+    wcs = camera_wcs()
+    sky = wcs.pixel_to_world([10.0, 20.0], [30.0, 40.0])
+    assert isinstance(sky, SkyCoord)
+    assert sky.frame.name == "icrs"
+    assert_allclose(sky.ra.deg, wcs([10.0, 20.0], [30.0, 40.0])[0])
+    assert_allclose(wcs.world_to_pixel(sky), ([10.0, 20.0], [30.0, 40.0]), atol=1e-8)
+    # Another frame is transformed first.
+    assert_allclose(wcs.world_to_pixel(sky.galactic), ([10.0, 20.0], [30.0, 40.0]), atol=1e-7)
+    assert [int(i) for i in wcs.world_to_array_index(sky[0])] == [30, 10]
+    with pytest.raises(TypeError):
+        wcs.invert(sky)
+
+
+def test_quantities():
+    wcs = camera_wcs()
+    ra, dec = wcs(10 * u.pix, 20 * u.pix)
+    assert ra.unit == dec.unit == u.deg
+    assert_allclose((ra.value, dec.value), wcs(10, 20))
+    x, y = wcs.invert(ra, dec)
+    assert_allclose((x.to_value(u.pix), y.to_value(u.pix)), (10, 20), atol=1e-8)
+
+
+def test_slicing_and_footprint():
+    wcs = camera_wcs()
+    footprint = wcs.footprint()
+    assert footprint.shape == (4, 2)
+    corners = ([-0.5, -0.5, NX - 0.5, NX - 0.5], [-0.5, NY - 0.5, NY - 0.5, -0.5])
+    assert_allclose(footprint.T, wcs(*corners))
+    sliced = SlicedLowLevelWCS(wcs, (slice(100, 200), slice(50, 80)))
+    assert sliced.pixel_shape == (30, 100)
+    assert_allclose(sliced.pixel_to_world_values(0, 0), wcs(50, 100))
+    assert_allclose(HighLevelWCSWrapper(sliced).world_to_pixel(wcs.pixel_to_world(55, 107)), (5, 7))
+    wcs.bounding_box = ((99.5, 199.5), (49.5, 79.5))
+    assert np.all(np.isnan(wcs(90, 60)))
+    assert_allclose(wcs.invert(*wcs(110, 60)), (110, 60), atol=1e-8)
+    assert np.all(np.isnan(wcs.invert(*wcs(90, 60, with_bounding_box=False))))
+    wcs.bounding_box = None
+    assert np.all(np.isfinite(wcs(90, 60)))
+    assert_allclose(wcs.invert(*wcs(90, 60)), (90, 60), atol=1e-8)
+
+
+def test_without_an_image_shape(rng):
+    wcs = build_wcs(crpix=CRPIX, cd=SCALE * np.eye(2), crval=(10, 20), pv=PVPolynomial(pv1_4=0.1))
+    assert wcs.bounding_box is None
+    assert wcs.pixel_shape is None
+    points = rng.uniform(-1e4, 2e4, (2, 100))
+    assert_allclose(wcs.invert(*wcs(*points)), points, rtol=0, atol=2e-8)
+
+
+def test_other_steps_can_be_inserted(rng):
+    """A user's own frames and transforms: slower, and as right as before."""
+    wcs = camera_wcs()
+    x, y = detector_points(rng, 100)
+    expected = wcs(x, y)
+    box = wcs.bounding_box.bounding_box(order="F")
+    mosaic = cf.Frame2D(name="mosaic", unit=(u.pix, u.pix))
+    wcs.insert_frame(mosaic, Shift(-100.0) & Shift(50.0), wcs.detector)
+    wcs.bounding_box = tuple(
+        (low + d, high + d) for (low, high), d in zip(box, (100, -50), strict=True)
+    )
+    assert not isinstance(wcs.forward_transform, DetectorToSky)
+    assert_allclose(wcs(x + 100, y - 50), expected, rtol=0, atol=1e-12)
+    assert_allclose(wcs.invert(*expected), (x + 100, y - 50), rtol=0, atol=2e-8)
+    # A transform that hands its input through must not have it masked in place.
+    plain = DetectorWCS([(cf.Frame2D(name="a"), Identity(2)), (cf.Frame2D(name="b"), None)])
+    plain.bounding_box = ((0, 10), (0, 10))
+    values = np.array([5.0, 20.0])
+    assert np.isnan(plain(values, values)[0]).tolist() == [False, True]
+    assert values.tolist() == [5.0, 20.0]
+
+
+def test_pickle_and_copy_of_a_wcs(rng):
+    wcs = camera_wcs()
+    points = detector_points(rng, 50)
+    expected = wcs(*points)
+    for other in (pickle.loads(pickle.dumps(wcs)), copy.deepcopy(wcs)):
+        assert isinstance(other, DetectorWCS)
+        assert_allclose(other(*points), expected, rtol=0, atol=0)
+        assert other.pixel_shape == wcs.pixel_shape
+        assert_allclose(other.invert(*expected), points, atol=2e-8)
+
+
+def test_build_wcs_arguments():
+    wcs = build_wcs(crpix=(1, 2), cd=np.eye(2), crval=SkyCoord(10 * u.deg, 20 * u.deg))
+    assert_allclose(wcs(1, 2), (10, 20))
+    with pytest.raises(ValueError, match="cd must be invertible"):
+        build_wcs(crpix=(1, 2), cd=np.zeros((2, 2)), crval=(10, 20))
+    with pytest.raises(ValueError, match="image_shape must be positive"):
+        build_wcs(crpix=(1, 2), cd=np.eye(2), crval=(10, 20), image_shape=(0, 5))
+    with pytest.raises(TypeError, match="lookup_table must be a LookupTable"):
+        build_wcs(crpix=(1, 2), cd=np.eye(2), crval=(10, 20), lookup_table=np.zeros((5, 5)))
+
+
+# --- stock form
+
+
+def deviation_px(wcs, ra, dec, expected):
+    """Distance of two sets of positions in pixels along the axes."""
+    sky = wcs.pipeline[1].transform
+    offset = np.subtract(project(ra, dec, sky.crval.value), project(*expected, sky.crval.value))
+    return np.linalg.inv(sky.cd.value) @ offset
+
+
+@pytest.mark.parametrize("crval", [(120.0, 30.0), (0.0, -90.0), (0.0, 89.97)])
+@pytest.mark.parametrize("table", [None, "linear", "cubic"])
+def test_stock_wcs_is_the_same(table, crval, rng):
+    wcs = camera_wcs(crval, 25.0, table=table)
+    stock = to_stock_wcs(wcs)
+    assert type(stock) is gwcs.WCS
+    assert stock.available_frames == wcs.available_frames
+    assert stock.pixel_shape == wcs.pixel_shape
+    assert stock.pixel_bounds == wcs.pixel_bounds
+    x, y = detector_points(rng, 500)
+    expected = wcs(x, y)
+    assert_allclose(deviation_px(wcs, *stock(x, y), expected), 0, atol=1e-7)
+    undistorted = wcs.get_transform("detector", "undistorted")(x, y)
+    assert_allclose(stock.get_transform("detector", "undistorted")(x, y), undistorted, atol=1e-7)
+    assert np.all(np.isnan(stock(-5.0, 3.0)))
+    # A bilinear table has kinks that no smooth inverse follows.
+    found = stock.invert(*expected, with_bounding_box=False)
+    assert_allclose(found, (x, y), rtol=0, atol=5e-3 if table == "linear" else 2e-4)
+
+
+def test_stock_wcs_with_radial_terms(rng):
+    # Amplitudes of some px on a field of 0.1 deg.
+    pv = PVPolynomial(7, radial=True, pv1_3=1e-3, pv2_3=-2e-3, pv1_11=0.2, pv2_23=9.0, pv1_32=300.0)
+    wcs = build_wcs(
+        crpix=CRPIX, cd=SCALE * rotation(30.0), crval=(50, 60), pv=pv, image_shape=(NY, NX)
+    )
+    stock = to_stock_wcs(wcs)
+    x, y = detector_points(rng, 500)
+    expected = wcs(x, y)
+    assert_allclose(deviation_px(wcs, *stock(x, y), expected), 0, atol=1e-7)
+
+
+def test_stock_wcs_as_a_file(tmp_path, rng):
+    wcs = camera_wcs()
+    path = tmp_path / "stock.asdf"
+    asdf.AsdfFile({"wcs": to_stock_wcs(wcs)}).write_to(path)
+    assert path.stat().st_size < 1_000_000
+    assert b"wpdc" not in path.read_bytes()
+    with asdf.open(path, lazy_load=False) as file:
+        stock = file["wcs"]
+    x, y = detector_points(rng, 300)
+    assert_allclose(deviation_px(wcs, *stock(x, y), wcs(x, y)), 0, atol=1e-7)
+    assert_allclose(stock.invert(*wcs(x, y), with_bounding_box=False), (x, y), atol=2e-4)
+
+
+def test_stock_wcs_without_a_range_or_an_inverse():
+    wcs = build_wcs(crpix=CRPIX, cd=SCALE * np.eye(2), crval=(10, 20))
+    stock = to_stock_wcs(wcs)
+    assert_allclose(stock(10.0, 20.0), wcs(10.0, 20.0), rtol=1e-14)
+    with pytest.raises(NotImplementedError):
+        _ = stock.get_transform("detector", "undistorted").inverse
+    with pytest.raises(ValueError, match="wcs must consist of the steps"):
+        to_stock_wcs(stock)
+
+
+# --- whole images
+
+
+def test_sky_map(tmp_path):
+    shape = (301, 517)
+    wcs = camera_wcs((0.0, 45.0), shape=shape)
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(float)
+    expected = wcs(x, y)
+    assert_allclose(sky_map(wcs), expected, rtol=0, atol=1e-12)
+    out = np.zeros((2, *shape))
+    ra, dec = sky_map(wcs, out=out)
+    assert_allclose(out, expected, rtol=0, atol=1e-12)
+    assert ra.base is out
+    assert dec.base is out
+    pair = (np.zeros(shape), np.zeros(shape))
+    assert sky_map(wcs, out=pair)[0] is pair[0]
+    assert_allclose(pair, expected, rtol=0, atol=1e-12)
+    path = tmp_path / "map.npy"
+    sky_map(wcs, out=path)
+    assert_allclose(np.load(path), expected, rtol=0, atol=1e-12)
+    assert_allclose(sky_map(wcs, image_shape=(3, 4))[0], expected[0][:3, :4], rtol=0, atol=1e-12)
+    # Any other WCS goes the same way.
+    assert_allclose(
+        sky_map(to_stock_wcs(wcs), image_shape=(3, 4))[0], expected[0][:3, :4], rtol=1e-12
+    )
+    with pytest.raises(FileExistsError, match="out must be a new file"):
+        sky_map(wcs, out=path)
+    with pytest.raises(ValueError, match=r"out must hold two arrays of the shape \(301, 517\)"):
+        sky_map(wcs, out=np.zeros((2, 3, 4)))
+    with pytest.raises(ValueError, match="image_shape must be given"):
+        sky_map(build_wcs(crpix=(1, 1), cd=np.eye(2), crval=(0, 0)))
+
+
+def test_sky_map_needs_no_memory_of_its_own():
+    shape = (1500, 1600)
+    wcs = camera_wcs(shape=shape)
+    out = np.zeros((2, *shape))
+    sky_map(wcs, image_shape=(2, 2))
+    tracemalloc.start()
+    sky_map(wcs, out=out)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 0.3 * out.nbytes
