@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from scipy.interpolate import CubicSpline, RBFInterpolator
+from scipy.interpolate import CubicSpline, RBFInterpolator, RectBivariateSpline
 from scipy.linalg import eigh, lapack, qr
 
 from wpdc_gwcs.exceptions import FitError
@@ -347,8 +347,16 @@ _KERNELS = (
 )
 _MAX_DEGREE = 7
 
+# Gaussians up to this epsilon are worth a low-rank factor; what it leaves out of a unit diagonal.
+_FULL_RANK_EPSILON = 4.5
+_LOW_RANK_TOLERANCE = 1e-11
+
+# Nodes of the pilot surface along each axis: twice as dense as the table's for the paper's
+# detector.
+_PILOT_NODES = 71
+
 # Candidates that go from generalised cross-validation on to cross-validation over exposures.
-_N_SHORTLIST = 6
+_N_SHORTLIST = 5
 
 # Fewer stars than this do not carry a table.
 _MIN_STARS_TABLE = 60
@@ -536,18 +544,29 @@ class _Bins:
 
     def debiased(self, pilot):
         """Values at the centroids: means less the curvature of the pilot surface over each bin."""
-        return self.value - self.curvature(pilot)
-
-    def curvature(self, pilot):
-        """Half the trace of the pilot's Hessian times the second moments, ``(M, 2)``."""
-        h = 0.01
-        steps = ((0, 0), (h, 0), (-h, 0), (0, h), (0, -h), (h, h), (-h, -h), (h, -h), (-h, h))
-        f = [pilot(self.u + a, self.v + b) for a, b in steps]
-        xx = (f[1] + f[2] - 2 * f[0]) / h**2
-        yy = (f[3] + f[4] - 2 * f[0]) / h**2
-        xy = (f[5] + f[6] - f[7] - f[8]) / (4 * h**2)
         mxx, mxy, myy = self.moments[:, :, None]
-        return 0.5 * (mxx * xx + 2 * mxy * xy + myy * yy)
+        xx, xy, yy = pilot.hessian(self.u, self.v)
+        return self.value - 0.5 * (mxx * xx + 2 * mxy * xy + myy * yy)
+
+
+class _Pilot:
+    """Smooth surface on a grid of nodes: values for a draft table, curvature for the bins."""
+
+    def __init__(self, surface, bins):
+        grids = [np.linspace(-1.0, 1.0, _PILOT_NODES) * m for m in (bins.middle + 0.5) / bins.half]
+        u, v = np.meshgrid(*grids)
+        values = surface(u.ravel(), v.ravel()).reshape(*u.shape, 2)
+        self.splines = [RectBivariateSpline(*grids, values[:, :, k].T) for k in range(2)]
+
+    def __call__(self, u, v):
+        return np.stack([f(u, v, grid=False) for f in self.splines], axis=1)
+
+    def hessian(self, u, v):
+        """Second derivatives (xx, xy, yy), each ``(N, 2)``."""
+        return [
+            np.stack([f(u, v, dx=i, dy=2 - i, grid=False) for f in self.splines], axis=1)
+            for i in (2, 1, 0)
+        ]
 
 
 def _kernel(name, epsilon, u, v, u2, v2):
@@ -584,51 +603,68 @@ class _Spectrum:
 
     def __init__(self, bins, value, kernel, epsilon, least_degree):
         root = np.sqrt(bins.weight)
-        k = _kernel(kernel, epsilon, bins.u, bins.v, bins.u, bins.v)
-        k *= root[:, None]
-        k *= root
         p = _n_terms(least_degree)
         basis = _polynomials(bins.u, bins.v, _MAX_DEGREE) * root[:, None]
         (reflectors, tau), _ = qr(basis[:, :p], mode="raw")
-        target = np.hstack([value * root[:, None], basis[:, p:]])
 
-        def rotate(matrix, side, transpose):
-            out, _, status = lapack.dormqr(
-                side, transpose, reflectors, tau, np.asfortranarray(matrix), 64 * max(matrix.shape)
-            )
-            return out
+        def rotate(matrix, side="L", transpose="T"):
+            matrix = np.asfortranarray(matrix)
+            work = 64 * max(matrix.shape)
+            return lapack.dormqr(side, transpose, reflectors, tau, matrix, work, overwrite_c=1)[0]
 
-        k = rotate(rotate(k, "L", "T"), "R", "N")[p:, p:]
-        target = rotate(target, "L", "T")[p:]
-        eigenvalues, vectors = eigh(k, overwrite_a=True, driver="evd", check_finite=False)
+        k = _kernel(kernel, epsilon, bins.u, bins.v, bins.u, bins.v)
+        if kernel == "gaussian" and epsilon < _FULL_RANK_EPSILON:
+            # Long lengths have few modes: K = F F^T of low rank, and the Gram matrix of F is small.
+            factor = rotate(_low_rank(k) * root[:, None])[p:]
+            squares, vectors = eigh(factor.T @ factor, overwrite_a=True, driver="evd")
+            good = squares > 1e-14 * squares[-1]
+            eigenvalues = squares[good]
+            vectors = (factor @ vectors[:, good]) / np.sqrt(eigenvalues)
+        else:
+            k *= root[:, None]
+            k *= root
+            k = rotate(rotate(k), "R", "N")[p:, p:]
+            eigenvalues, vectors = eigh(k, overwrite_a=True, driver="evd", check_finite=False)
+        target = rotate(np.hstack([value * root[:, None], basis[:, p:]]))[p:]
         self.least_degree, self.n = least_degree, len(bins)
         self.eigenvalues = np.maximum(eigenvalues, 0.0)
-        target = vectors.T @ target
-        self.target, self.basis = target[:, :2], target[:, 2:]
+        self.modes = vectors.T @ target
+        # What no mode reaches is all residual.
+        self.rest = target.T @ target - self.modes.T @ self.modes
+        self.n_rest = len(target) - len(eigenvalues)
 
-    def scores(self, degree, smoothing):
-        """Generalised cross-validation and effective parameters of each smoothing."""
-        extra = self.basis[:, : _n_terms(degree) - _n_terms(self.least_degree)]
-        out = []
-        for s in smoothing:
-            g = s / (self.eigenvalues + s)  # residual of each mode without further polynomials
-            residual, trace = g[:, None] * self.target, g.sum()
-            if extra.shape[1]:
-                ge = g[:, None] * extra
-                normal = extra.T @ ge
-                solved = np.linalg.lstsq(
-                    normal, np.hstack([extra.T @ residual, ge.T @ ge]), rcond=1e-13
-                )[0]
-                residual = residual - ge @ solved[:, :2]
-                trace -= np.trace(solved[:, 2:])
-            out.append((np.sum(residual**2) * self.n / (2 * trace**2), self.n - trace))
-        return np.array(out).T
+    def scores(self, smoothing, degrees):
+        """Generalised cross-validation and effective parameters, one row per degree."""
+        g = smoothing[:, None] / (self.eigenvalues + smoothing[:, None])
+        q = self.modes.shape[1]
+        # Products of data (first two) and polynomials, once and twice through the residual matrix.
+        products = (self.modes[:, :, None] * self.modes[:, None, :]).reshape(-1, q * q)
+        once = (g @ products).reshape(-1, q, q) + self.rest
+        twice = (g**2 @ products).reshape(-1, q, q) + self.rest
+        square = twice[:, 0, 0] + twice[:, 1, 1]
+        trace = g.sum(1) + self.n_rest
+        for degree in degrees:
+            e = slice(2, 2 + _n_terms(degree) - _n_terms(self.least_degree))
+            inverse = np.linalg.pinv(once[:, e, e], rcond=1e-13, hermitian=True)
+            c = inverse @ once[:, e, :2]
+            twice_c = twice[:, e, e] @ c
+            left = square + np.sum(c * (twice_c - 2 * twice[:, e, :2]), axis=(1, 2))
+            freedom = trace - np.sum(inverse * twice[:, e, e], axis=(1, 2))
+            yield left * self.n / (2 * freedom**2), self.n - freedom
+
+
+def _low_rank(kernel):
+    """Factor F of a positive semi-definite matrix, K = F F^T, by pivoted Cholesky decomposition."""
+    factor, pivots, rank, _ = lapack.dpstrf(kernel, tol=_LOW_RANK_TOLERANCE, lower=1)
+    factor = np.tril(factor)[:, :rank]
+    out = np.empty_like(factor)
+    out[pivots - 1] = factor
+    return out
 
 
 def _smoothings(spectrum):
     """Half-decade steps from barely to wholly smoothed."""
-    largest = spectrum.eigenvalues.max()
-    return largest * 10.0 ** np.arange(-10.0, 3.01, 0.5)
+    return spectrum.eigenvalues.max() * 10.0 ** np.arange(-10.0, 3.01, 0.5)
 
 
 def _choose(coarse, *, allow_none):
@@ -664,10 +700,10 @@ def _best_of(spectrum, kernel, epsilon, bins):
     """Best smoothing of each degree, best first."""
     found = []
     smoothing = _smoothings(spectrum)
-    for degree in range(spectrum.least_degree, _MAX_DEGREE + 1):
-        if 2 * _n_terms(degree) > len(bins):
-            break
-        score, freedom = spectrum.scores(degree, smoothing)
+    degrees = [
+        d for d in range(spectrum.least_degree, _MAX_DEGREE + 1) if 2 * _n_terms(d) <= len(bins)
+    ]
+    for degree, (score, freedom) in zip(degrees, spectrum.scores(smoothing, degrees)):
         # A smoother that follows nearly every bin has no residuals to be judged by.
         score = np.where(freedom < 0.9 * len(bins), score, np.inf)
         k = int(np.argmin(score))
@@ -741,8 +777,8 @@ def _solve(bins, value, choice):
 
 def _pilot(bins, choice):
     """Smooth surface on the coarse bins whose curvature corrects bin means, in two rounds."""
-    surface = _solve(bins, bins.value, choice)
-    return _solve(bins, bins.debiased(surface), choice)
+    first = _Pilot(_solve(bins, bins.value, choice), bins)
+    return _Pilot(_solve(bins, bins.debiased(first), choice), bins)
 
 
 def _interpolate(bins, value, choice):
