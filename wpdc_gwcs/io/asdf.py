@@ -66,7 +66,9 @@ def write_asdf(obj, path, *, overwrite=False):
         tree |= {"kind": "calibration", "software": software, **_fields_of(obj, _NOT_STORED)}
     else:
         tree |= {"kind": "solution", "software": software, "solution": _fields_of(obj, set())}
-    _write_tree({"wcs": to_stock_wcs(obj.wcs), "wpdc": tree}, path, overwrite)
+    # A residual map is mostly empty bins.
+    compression = "zlib" if getattr(obj, "residual_map", None) is not None else None
+    _write_tree({"wcs": to_stock_wcs(obj.wcs), "wpdc": tree}, path, overwrite, compression)
 
 
 def write_stock(obj, path, *, overwrite=False):
@@ -114,8 +116,12 @@ def read_asdf(path):
     FileFormatError
         If the file is damaged, of a newer format version or not of this kind.
     """
-    tree = _read_tree(path)
-    tree = tree.get("wpdc")
+    # What follows the data is not needed to read them, but where it is cut, so may be anything.
+    with open(path, "rb") as file:
+        file.seek(max(0, Path(path).stat().st_size - 4096))
+        if not file.read().rstrip(b"\0\r\n ").endswith(b"..."):
+            raise FileFormatError(f"{path}: truncated ASDF file: must end with '...', does not")
+    tree = _read_tree(path).get("wpdc")
     if not isinstance(tree, dict):
         raise FileFormatError(f"{path}: must have a 'wpdc' tree, has none: not a wpdc_gwcs file")
     _check_version(tree, path)
@@ -157,11 +163,11 @@ def read_asdf_wcs(path):
     return wcs
 
 
-def _write_tree(tree, path, overwrite):
+def _write_tree(tree, path, overwrite, compression=None):
     with atomic_path(path, overwrite=overwrite) as temporary, asdf.config_context() as config:
         # Small arrays stay legible.
         config.array_inline_threshold = 64
-        asdf.AsdfFile(tree).write_to(temporary)
+        asdf.AsdfFile(tree).write_to(temporary, all_array_compression=compression)
 
 
 def _read_tree(path):

@@ -258,16 +258,16 @@ def _read_mandatory(file, path, error, number):
         if found["length"] == 0 and block[:8] not in (b"SIMPLE  ", b"XTENSION"):
             # The end, or what the standard calls special records and tells readers to skip.
             return None
-        if len(block) < _BLOCK and b"END" not in block:
-            raise error(f"{path}: truncated file: the header of HDU {number} does not end")
         found["length"] += _BLOCK
         for i in range(0, len(block), 80):
             card = block[i : i + 80]
-            if card[:8] == b"END     ":
+            if card[:8] == b"END     " and len(block) == _BLOCK:
                 return found
             if match := wanted.match(card):
                 value = match[2]
                 found[match[1].decode()] = True if value == b"T" else int(value)
+        if len(block) < _BLOCK:
+            raise error(f"{path}: truncated file: the header of HDU {number} does not end")
 
 
 def check_output(path, *, overwrite):

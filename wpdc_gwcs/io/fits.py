@@ -20,7 +20,6 @@ import warnings
 import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS
-from numpy.polynomial import polynomial
 
 from wpdc_gwcs.exceptions import FileFormatError, WPDCWarning
 from wpdc_gwcs.io.files import READ_ERRORS, atomic_path, file_kind, first_line, open_fits, stem_of
@@ -32,6 +31,7 @@ from wpdc_gwcs.io.headers import (
     parse_tan,
     split_extension,
 )
+from wpdc_gwcs.io.sip import fit_sip, fit_sip_inverse
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project
 from wpdc_gwcs.solution import Calibration, DistortionSolution
 
@@ -266,23 +266,28 @@ def write_sip(obj, path, *, overwrite=False, degree=None):
     _require_shape(obj)
     if degree is not None and degree not in _SIP_DEGREES:
         raise ValueError(f"degree must be from 2 to 9, got {degree}")
-    samples = _sip_samples(obj)
+    pixels, plane = _sip_samples(obj)
     trials = []
     for n in _SIP_DEGREES if degree is None else [degree]:
-        header, inverse = _sip_header(obj, samples, n)
-        worst = deviation(obj, _astropy_sky([fits.PrimaryHDU(header=header)]), n=151)
-        trials.append((worst, header, inverse))
+        sip = fit_sip(pixels, plane, n)
+        worst = deviation(obj, _astropy_sky(_sip_hdus(obj, sip)), n=151)
+        trials.append((worst, sip))
         if worst < 1e-4:
             break
     best = min(trial[0] for trial in trials)
-    _, header, inverse = next(trial for trial in trials if trial[0] <= 1.1 * best)
-    worst = deviation(obj, _astropy_sky([fits.PrimaryHDU(header=header)]))
+    sip = next(trial[1] for trial in trials if trial[0] <= 1.1 * best)
+    worst = deviation(obj, _astropy_sky(_sip_hdus(obj, sip)))
+    for n in _SIP_DEGREES:
+        inverse, inverse_worst = fit_sip_inverse(sip, pixels, plane, n)
+        if inverse_worst <= max(worst, 1e-3):
+            break
+    hdus = _sip_hdus(obj, sip, inverse)
     _add_history(
-        header,
+        hdus[0].header,
         f"greatest deviation of the SIP approximation: {worst:.3g} px, "
-        f"of its inverse polynomials (AP, BP): {inverse:.3g} px",
+        f"of its inverse polynomials (AP, BP): {inverse_worst:.3g} px",
     )
-    _write_hdus([fits.PrimaryHDU(header=header)], path, overwrite)
+    _write_hdus(hdus, path, overwrite)
     return worst
 
 
@@ -605,62 +610,17 @@ def _sip_samples(obj):
     return np.array([x, y]), cd @ (undistorted - np.asarray(solution.crpix)[:, None])
 
 
-def _sip_header(obj, samples, degree):
-    """Give a SIP approximation of one degree, and the error of its inverse polynomials in px."""
-    pixels, plane = samples
-    center = pixels.mean(axis=1)
-    scale = np.abs(pixels - center[:, None]).max()
-    # Where the fit meets CRVAL: the reference pixel of a form without constant terms.
-    c = _fit_terms(*(pixels - center[:, None]), plane, scale, degree, least=0)
-    crpix = center + _root(c)
-    u = pixels - crpix[:, None]
-    c = _fit_terms(*u, plane, scale, degree, least=1)
-    linear = np.column_stack([c[:, 1, 0], c[:, 0, 1]])
-    forward = np.einsum("ij,jpq->ipq", np.linalg.inv(linear), c)
-    w = np.linalg.solve(linear, plane)
-    inverse = _fit_terms(*w, u - w, np.abs(w).max(), degree, least=0)
-    header = _linear_header(obj, "TAN-SIP", crpix, linear, _parts(obj)[2])
-    for tag, terms, least in (("", forward, 2), ("P", inverse, 0)):
-        for axis, letter in enumerate("AB"):
+def _sip_hdus(obj, sip, inverse=None):
+    header = _linear_header(obj, "TAN-SIP", sip.crpix, sip.cd, _parts(obj)[2])
+    for tag, terms in (("", sip.terms), ("P", inverse)):
+        if terms is None:
+            continue
+        degree = terms.shape[1] - 1
+        for letter, axis in zip("AB", terms, strict=True):
             header[f"{letter}{tag}_ORDER"] = (degree, "degree of the polynomial")
-            for p in range(degree + 1):
-                for q in range(degree + 1 - p):
-                    if p + q >= least:
-                        value = terms[axis, p, q]
-                        header.append(_number_card(f"{letter}{tag}_{p}_{q}", value), end=True)
+            for p, q in np.argwhere(np.add.outer(range(degree + 1), range(degree + 1)) <= degree):
+                # The standard has neither constant nor linear terms in the forward polynomials.
+                if tag or p + q > 1:
+                    header.append(_number_card(f"{letter}{tag}_{p}_{q}", axis[p, q]), end=True)
     _add_provenance(header, obj)
-    back = w + np.array([polynomial.polyval2d(*w, inverse[i]) for i in (0, 1)])
-    return header, float(np.hypot(*(back - u)).max())
-
-
-def _fit_terms(u, v, values, scale, degree, *, least):
-    """Fit coefficients [axis, p, q] of u^p v^q with least <= p + q <= degree."""
-    powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p) if p + q >= least]
-    # A scaled basis keeps the powers comparable.
-    design = np.column_stack([(u / scale) ** p * (v / scale) ** q for p, q in powers])
-    solution = np.linalg.lstsq(design, values.T, rcond=None)[0]
-    terms = np.zeros((2, degree + 1, degree + 1))
-    for (p, q), value in zip(powers, solution, strict=True):
-        terms[:, p, q] = value / scale ** (p + q)
-    return terms
-
-
-def _root(terms):
-    """Find where a fitted polynomial map is zero."""
-    z = -np.linalg.solve(np.column_stack([terms[:, 1, 0], terms[:, 0, 1]]), terms[:, 0, 0])
-    for _ in range(50):
-        value = np.array([polynomial.polyval2d(*z, c) for c in terms])
-        jacobian = np.array(
-            [
-                [
-                    polynomial.polyval2d(*z, polynomial.polyder(c, axis=0)),
-                    polynomial.polyval2d(*z, polynomial.polyder(c, axis=1)),
-                ]
-                for c in terms
-            ]
-        )
-        step = np.linalg.solve(jacobian, value)
-        z -= step
-        if np.abs(step).max() < 1e-10:
-            break
-    return z
+    return [fits.PrimaryHDU(header=header)]

@@ -6,7 +6,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from wpdc_gwcs.exceptions import FileFormatError
-from wpdc_gwcs.io.files import file_kind, split_extension
+from wpdc_gwcs.io.files import check_output, file_kind, split_extension
 from wpdc_gwcs.io.headers import parse_tan, parse_wcs, read_headers
 
 __all__ = ["FORMATS", "read", "read_wcs", "write"]
@@ -165,6 +165,8 @@ def write(obj, path, *, format=None, overwrite=False):
         return write_table(obj, path, overwrite=overwrite)
     if format not in FORMATS:
         raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {format!r} for {path}")
+    # Before the work, not after.
+    check_output(path, overwrite=overwrite)
     return _writer(format)(obj, path, overwrite=overwrite)
 
 

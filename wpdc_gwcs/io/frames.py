@@ -19,6 +19,7 @@ from astropy.table import Table
 
 from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
 from wpdc_gwcs.frame import Frame
+from wpdc_gwcs.io.dates import header_epoch
 from wpdc_gwcs.io.files import (
     READ_ERRORS,
     file_kind,
@@ -31,7 +32,6 @@ from wpdc_gwcs.io.headers import (
     clean_header,
     extension_names,
     find_extension,
-    header_epoch,
     header_shape,
     header_text,
     parse_wcs,

@@ -1,0 +1,734 @@
+"""Calibrations and solutions in all formats; truth is astropy.wcs and what was written."""
+
+import os
+import shutil
+import subprocess
+import warnings
+
+import asdf
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+from astropy.wcs import WCS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.polynomial import polynomial
+
+from wpdc_gwcs import build_wcs
+from wpdc_gwcs.exceptions import FileFormatError, InputError, WPDCWarning
+from wpdc_gwcs.io import OutputExistsError, read, read_wcs, write
+from wpdc_gwcs.io.asdf import FORMAT_VERSION
+from wpdc_gwcs.lookup import ResidualMap
+from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
+from wpdc_gwcs.solution import Calibration, DistortionSolution
+
+
+def make_calibration(
+    *,
+    n=2048,
+    scale=0.3,
+    roll=25.0,
+    crval=(294.6, 35.1),
+    amplitude=20.0,
+    table="cubic",
+    degree=3,
+    seed=1,
+):
+    """A calibration with a distortion of some `amplitude` px and a table of some 0.1 px."""
+    rng = np.random.default_rng(seed)
+    nx, ny = n, n + 16
+    px, angle = scale / 3600, np.radians(roll)
+    cd = px * np.array([[-np.cos(angle), np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    terms = pv_terms(degree)
+    total = terms.own + terms.other
+    coefficients = rng.normal(size=(2, len(total))) * amplitude * px / (px * n / 2) ** total / 4
+    coefficients[:, 1] += 1.0
+    pv = PVPolynomial.from_coefficients(coefficients, degree=degree)
+    x, y = np.linspace(-0.5, nx - 0.5, 12), np.linspace(-0.5, ny - 0.5, 13)
+    dx, dy = rng.normal(size=(2, 13, 12)) * 0.1
+    lookup_table = LookupTable(x, y, dx, dy, method=table) if table else None
+    solution = DistortionSolution(
+        detector="NE",
+        image_shape=(ny, nx),
+        crpix=np.array([(nx - 1) / 2 + 0.1, (ny - 1) / 2 - 0.2]),
+        cd=cd,
+        crval=np.array(crval, float),
+        pv=pv,
+        lookup_table=lookup_table,
+        pv_covariance=np.stack([np.eye(len(total))] * 2) * 1e-9,
+        table_sigma=None if lookup_table is None else np.full((3, 13, 12), 0.01),
+        residual_map=ResidualMap.from_residuals(
+            *rng.uniform(0, n, (2, 50)),
+            *rng.normal(size=(2, 50)),
+            x_err=0.1,
+            y_err=0.1,
+            image_shape=(ny, nx),
+        ),
+        statistics={"n_stars": np.int64(50), "sigma": np.array([0.1, 0.2])},
+        settings={"weight": "exp-sqrt", "r0": 4000.0, "lut": None},
+        provenance={"time": "2026-01-01T00:00:00", "inputs": ("a.fits", "b.fits")},
+    )
+    turn = np.eye(2) + rng.normal(size=(2, 2)) * 1e-4
+    return Calibration(
+        frame="e00",
+        solution=solution,
+        crval=np.array(crval) + 0.001,
+        cd=turn @ cd,
+        attitude_covariance=np.eye(6) * 1e-12,
+        statistics={"rms_mas": np.float64(12.5)},
+        settings={"refine": "attitude"},
+        provenance={"frame": "e00.fits"},
+    )
+
+
+@pytest.fixture
+def calibration():
+    return make_calibration()
+
+
+def grid(calibration, n=41):
+    ny, nx = calibration.solution.image_shape
+    x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, n), np.linspace(-0.5, ny - 0.5, n))
+    return x.ravel(), y.ravel()
+
+
+def distance(calibration, sky):
+    """Greatest distance in px of other sky positions of the grid."""
+    planes = [project(*s, calibration.crval) for s in (sky, calibration.wcs(*grid(calibration)))]
+    return np.hypot(*np.linalg.solve(calibration.cd, np.subtract(*planes))).max()
+
+
+def astropy_wcs(path, hdus=True):
+    with warnings.catch_warnings(), fits.open(path) as opened:
+        warnings.simplefilter("ignore")
+        return WCS(opened[0].header, opened if hdus else None)
+
+
+# --- ASDF ---------------------------------------------------------------------------------------
+
+
+def test_calibration_asdf_round_trip(tmp_path, calibration):
+    path = tmp_path / "e00.wcs.asdf"
+    assert write(calibration, path) is None
+    back = read(path)
+    assert isinstance(back, Calibration)
+    x, y = grid(calibration)
+    np.testing.assert_array_equal(back.wcs(x, y), calibration.wcs(x, y))
+    np.testing.assert_array_equal(back.cd, calibration.cd)
+    np.testing.assert_array_equal(back.attitude_covariance, calibration.attitude_covariance)
+    assert back.frame == "e00"
+    assert back.solution.detector == "NE"
+    assert back.solution.image_shape == (2064, 2048)
+    np.testing.assert_array_equal(
+        back.solution.lookup_table.dx, calibration.solution.lookup_table.dx
+    )
+    np.testing.assert_array_equal(back.solution.pv_covariance, calibration.solution.pv_covariance)
+    assert back.solution.residual_map is None  # the solution's own file has it
+    assert back.statistics == {"rms_mas": 12.5}
+    assert back.solution.settings == calibration.solution.settings
+    assert back.solution.provenance["inputs"] == ["a.fits", "b.fits"]
+    assert os.listdir(tmp_path) == ["e00.wcs.asdf"]
+
+
+def test_solution_asdf_round_trip(tmp_path, calibration):
+    path = tmp_path / "NE.solution.asdf"
+    write(calibration.solution, path)
+    back = read(path)
+    assert isinstance(back, DistortionSolution)
+    assert back.residual_map == calibration.solution.residual_map
+    x, y = grid(calibration)
+    np.testing.assert_array_equal(back.wcs(x, y), calibration.solution.wcs(x, y))
+    # Merging goes on where it stopped.
+    assert (back.residual_map + back.residual_map).n_stars == 100
+
+
+@pytest.mark.parametrize("table", [None, "linear", "cubic"])
+def test_stock_wcs_in_the_file(tmp_path, table):
+    calibration = make_calibration(table=table)
+    write(calibration, tmp_path / "a.wcs.asdf")
+    with asdf.open(tmp_path / "a.wcs.asdf", lazy_load=False, memmap=False) as file:
+        wcs = file["wcs"]
+        assert type(wcs).__module__.startswith("gwcs.")
+        # Nothing in the file needs this package: neither a tag nor a recorded extension.
+        used = str(file.tree.get("history", {}))
+    assert "wpdc" not in used
+    text = (tmp_path / "a.wcs.asdf").read_bytes().split(b"\n...")[0].decode()
+    assert not [line for line in text.splitlines() if "!" in line and "wpdc" in line.split("!")[1]]
+    assert distance(calibration, wcs(*grid(calibration))) < 2e-4
+    assert write(calibration, tmp_path / "stock.asdf", format="stock") < 2e-4
+    stock = read_wcs(tmp_path / "stock.asdf")
+    assert distance(calibration, stock(*grid(calibration))) < 2e-4
+    with pytest.raises(FileFormatError, match="must have a 'wpdc' tree"):
+        read(tmp_path / "stock.asdf")
+
+
+def edited(path, tmp_path, edit):
+    with asdf.open(path, lazy_load=False, memmap=False) as file:
+        tree = file.tree["wpdc"]
+        edit(tree)
+        asdf.AsdfFile({"wpdc": tree}).write_to(tmp_path / "edited.asdf")
+    return tmp_path / "edited.asdf"
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("format_version", "1.1.0", "must not be newer than 1.0.0, got 1.1.0"),
+        ("format_version", "2.0.0", "must not be newer than 1.0.0, got 2.0.0"),
+        ("format_version", "new", "must be like '1.0.0', got 'new'"),
+        ("kind", "map", "must be 'solution' or 'calibration', got 'map'"),
+        ("cd", [[1.0, 2.0]], r"cd must be finite and of the shape \(2, 2\)"),
+        ("crval", [1.0, float("nan")], "crval must be finite"),
+        ("solution", None, "damaged 'wpdc' tree"),
+    ],
+)
+def test_bad_trees(tmp_path, calibration, key, value, message):
+    write(calibration, tmp_path / "a.asdf")
+    path = edited(tmp_path / "a.asdf", tmp_path, lambda tree: tree.update({key: value}))
+    with pytest.raises(FileFormatError, match=f"edited.asdf.*{message}"):
+        read(path)
+
+
+@pytest.mark.parametrize("key", ["frame", "crval", "solution", "format_version"])
+def test_missing_entries(tmp_path, calibration, key):
+    write(calibration, tmp_path / "a.asdf")
+    path = edited(tmp_path / "a.asdf", tmp_path, lambda tree: tree.pop(key))
+    with pytest.raises(FileFormatError, match=key):
+        read(path)
+
+
+def test_bad_table_in_a_tree(tmp_path, calibration):
+    write(calibration, tmp_path / "a.asdf")
+
+    def spoil(tree):
+        tree["solution"]["lookup_table"]["dx"] = np.full((13, 12), np.nan)
+
+    with pytest.raises(FileFormatError, match="dx must be finite"):
+        read(edited(tmp_path / "a.asdf", tmp_path, spoil))
+
+
+@pytest.mark.parametrize("part", [0.02, 0.3, 0.5, 0.8, 0.95, 0.999])
+def test_truncated_asdf(tmp_path, calibration, part):
+    write(calibration, tmp_path / "a.asdf")
+    data = (tmp_path / "a.asdf").read_bytes()
+    (tmp_path / "b.asdf").write_bytes(data[: int(len(data) * part)])
+    with pytest.raises(FileFormatError, match=r"b.asdf: "):
+        read(tmp_path / "b.asdf")
+
+
+def test_no_asdf_of_ours(tmp_path):
+    asdf.AsdfFile({"a": 1}).write_to(tmp_path / "a.asdf")
+    with pytest.raises(FileFormatError, match="must have a 'wpdc' tree"):
+        read(tmp_path / "a.asdf")
+    with pytest.raises(FileFormatError, match="must have a 'wcs'"):
+        read_wcs(tmp_path / "a.asdf")
+
+
+def test_odd_values_are_refused_by_name(tmp_path, calibration):
+    calibration.settings["filter"] = object()
+    with pytest.raises(TypeError, match=r"settings\['filter'\] must be made of plain values"):
+        write(calibration, tmp_path / "a.asdf")
+    assert os.listdir(tmp_path) == []
+
+
+# --- FITS -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("table", [None, "linear", "cubic"])
+@pytest.mark.parametrize("degree", [1, 3, 5])
+def test_fits_round_trip(tmp_path, table, degree):
+    calibration = make_calibration(table=table, degree=degree)
+    path = tmp_path / "e00.fits"
+    assert write(calibration, path) is None
+    back = read(path)
+    x, y = grid(calibration)
+    np.testing.assert_array_equal(back.wcs(x, y), calibration.wcs(x, y))
+    assert (back.frame, back.solution.detector) == ("e00", "NE")
+    assert back.solution.image_shape == (2064, 2048)
+    np.testing.assert_array_equal(back.solution.crval, calibration.solution.crval)
+
+
+def test_fits_from_the_keywords_alone(tmp_path, calibration):
+    """What another writer of the keywords would give: the attitude is in the polynomial."""
+    write(calibration, tmp_path / "a.fits")
+    with fits.open(tmp_path / "a.fits") as hdus:
+        fits.HDUList([h for h in hdus if h.name != "WPDC_INSTRUMENT"]).writeto(tmp_path / "b.fits")
+    back = read(tmp_path / "b.fits")
+    assert distance(calibration, back.wcs(*grid(calibration))) < 1e-9
+    np.testing.assert_array_equal(back.cd, back.solution.cd)
+    np.testing.assert_array_equal(back.cd, calibration.cd)
+    # Edited keywords count, not what the table of the instrument still says.
+    with fits.open(tmp_path / "a.fits") as hdus:
+        hdus[0].header["PV1_0"] += 1e-4
+        hdus.writeto(tmp_path / "c.fits")
+    assert distance(calibration, read(tmp_path / "c.fits").wcs(*grid(calibration))) > 1.0
+
+
+def test_fits_table_is_as_the_paper_has_it(tmp_path, calibration):
+    write(calibration, tmp_path / "a.fits")
+    rows = Table.read(tmp_path / "a.fits", hdu="WPDC_LUT")
+    table = calibration.solution.lookup_table
+    assert rows.colnames == ["X_GRID", "Y_GRID", "DX_LUT", "DY_LUT"]
+    assert len(rows) == 12 * 13
+    assert rows["X_GRID"][0] == 0.5  # the outer edge of the first pixel, counted from one
+    assert rows["X_GRID"][1] == table.x_grid[1] + 1
+    np.testing.assert_array_equal(rows["DX_LUT"], table.dx.ravel())
+
+
+def test_fits_header(tmp_path, calibration):
+    write(calibration, tmp_path / "a.fits")
+    header = fits.getheader(tmp_path / "a.fits")
+    assert header["CTYPE1"], header["CTYPE2"] == ("RA---TPV", "DEC--TPV")
+    assert (header["RADESYS"], header["CUNIT1"]) == ("ICRS", "deg")
+    for i in (1, 2):
+        for j in (1, 2):
+            assert header[f"CD{i}_{j}"] == calibration.cd[i - 1, j - 1]  # all 17 digits
+    history = "\n".join(header["HISTORY"])
+    assert "wpdc_gwcs" in history
+    assert "weight = exp-sqrt" in history
+    assert "refine = attitude" in history
+    # The PV part, for any reader of TPV.
+    plain = make_calibration(table=None)
+    got = astropy_wcs(tmp_path / "a.fits").all_pix2world(*grid(calibration), 0)
+    assert distance(plain, got) < 1e-6
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    st.floats(0, 360),
+    st.floats(0, 360),
+    st.sampled_from([-90.0, -89.9, -30.0, 0.0, 60.0, 89.99, 90.0]),
+    st.integers(0, 1000),
+    st.floats(0, 50),
+)
+def test_keywords_say_the_same_to_astropy(tmp_path_factory, roll, ra, dec, seed, amplitude):
+    calibration = make_calibration(
+        roll=roll, crval=(ra, dec), seed=seed, amplitude=amplitude, table=None
+    )
+    # A nominal pointing beyond the pole is none.
+    crval = np.array([ra, dec])
+    calibration = Calibration("a", calibration.solution, crval=crval, cd=calibration.cd)
+    path = tmp_path_factory.mktemp("a") / "a.fits"
+    write(calibration, path)
+    assert distance(calibration, astropy_wcs(path).all_pix2world(*grid(calibration), 0)) < 1e-6
+    assert distance(calibration, read(path).wcs(*grid(calibration))) < 1e-9
+
+
+@pytest.mark.parametrize("crval", [(0.0001, 0.0), (120.0, 89.95), (200.0, -60.0)])
+@pytest.mark.parametrize("table", [None, "linear", "cubic"])
+def test_cpdis_is_what_plain_astropy_sees(tmp_path, crval, table):
+    calibration = make_calibration(crval=crval, amplitude=100.0, table=table)
+    worst = write(calibration, tmp_path / "a.fits", format="cpdis")
+    assert worst < 1e-3
+    rng = np.random.default_rng(0)
+    ny, nx = calibration.solution.image_shape
+    x, y = rng.uniform(-0.5, nx - 0.5, 20000), rng.uniform(-0.5, ny - 0.5, 20000)
+    planes = [
+        project(*sky, calibration.crval)
+        for sky in (
+            astropy_wcs(tmp_path / "a.fits").all_pix2world(x, y, 0),
+            calibration.wcs(x, y),
+        )
+    ]
+    error = np.hypot(*np.linalg.solve(calibration.cd, np.subtract(*planes))).max()
+    assert error < 1.2 * worst + 1e-6
+    assert f"{worst:.3g} px" in str(fits.getheader(tmp_path / "a.fits")["HISTORY"])
+
+
+def test_cpdis_says_when_it_cannot(tmp_path, monkeypatch, calibration):
+    monkeypatch.setattr("wpdc_gwcs.io.fits._CPDIS_MOST_NODES", 10)
+    with pytest.warns(WPDCWarning, match="cannot be made dense enough"):
+        worst = write(calibration, tmp_path / "a.fits", format="cpdis")
+    assert worst > 1e-3
+
+
+def test_head_is_ascii_and_the_pv_part(tmp_path, calibration):
+    calibration.settings["observer"] = "Gärtner"
+    worst = write(calibration, tmp_path / "a.head")
+    assert 0.05 < worst < 1.0  # the look-up table
+    text = (tmp_path / "a.head").read_bytes()
+    assert text.isascii()
+    lines = text.decode().splitlines()
+    assert all(len(line) == 80 for line in lines)
+    assert lines[-1].rstrip() == "END"
+    plain = make_calibration(table=None)
+    assert distance(plain, read(tmp_path / "a.head").wcs(*grid(plain))) < 1e-9
+    assert write(plain, tmp_path / "b.head") < 1e-6
+
+
+def test_head_for_galsim(tmp_path):
+    galsim = pytest.importorskip("galsim")
+    calibration = make_calibration(table=None)
+    write(calibration, tmp_path / "a.head")
+    wcs = galsim.FitsWCS(str(tmp_path / "a.head"), text_file=True)
+    x, y = grid(calibration)
+    sky = np.degrees(wcs._radec(x + 1, y + 1))
+    assert distance(calibration, sky) < 1e-6
+
+
+def test_head_for_swarp(tmp_path):
+    """SWarp resamples an image of its own x (or y): every value says where it was taken from."""
+    swarp = next((p for name in ("SWarp", "swarp") if (p := shutil.which(name))), None)
+    if swarp is None:
+        pytest.skip("SWarp is not installed")
+    calibration = make_calibration(n=512, table=None, amplitude=5.0)
+    ny, nx = calibration.solution.image_shape
+    deviations = []
+    for axis in (0, 1):
+        ramp = np.broadcast_to(np.arange(nx), (ny, nx)) if axis == 0 else np.arange(ny)[:, None]
+        pixels = np.broadcast_to(ramp, (ny, nx)).astype(np.float32) + 1.0
+        fits.writeto(tmp_path / "a.fits", pixels, overwrite=True)
+        write(calibration, tmp_path / "a.head", overwrite=True)
+        options = {
+            "SUBTRACT_BACK": "N",
+            "RESAMPLING_TYPE": "BILINEAR",
+            "PROJECTION_ERR": "0.0",
+            "FSCALASTRO_TYPE": "NONE",
+            "WRITE_XML": "N",
+            "VERBOSE_TYPE": "QUIET",
+            "DELETE_TMPFILES": "Y",
+        }
+        arguments = [a for key, value in options.items() for a in (f"-{key}", value)]
+        subprocess.run(
+            [swarp, "a.fits", "-c", "/dev/null", *arguments],
+            cwd=tmp_path,
+            check=True,
+            capture_output=True,
+            timeout=60,
+        )
+        values, weights = (
+            fits.getdata(tmp_path / "coadd.fits"),
+            fits.getdata(tmp_path / "coadd.weight.fits"),
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            out = WCS(fits.getheader(tmp_path / "coadd.fits"))
+        v, u = np.nonzero(weights > 0.99 * weights.max())
+        expected = calibration.wcs.invert(*out.all_pix2world(u, v, 0))[axis] + 1.0
+        inside = (expected > 20) & (expected < 490)
+        assert inside.sum() > 1e5
+        deviations.append(np.abs(values[v, u] - expected)[inside].max())
+    # Values of some 500 in single precision.
+    assert max(deviations) < 1e-3
+
+
+def test_sip(tmp_path):
+    calibration = make_calibration(amplitude=50.0, table=None)
+    worst = write(calibration, tmp_path / "a.fits", format="sip")
+    assert worst < 1e-4
+    wcs = astropy_wcs(tmp_path / "a.fits")
+    assert wcs.wcs.ctype[0] == "RA---TAN-SIP"
+    assert distance(calibration, wcs.all_pix2world(*grid(calibration), 0)) <= 1.01 * worst + 1e-6
+    # The inverse polynomials are what viewers use.
+    x, y = grid(calibration)
+    origin = wcs.wcs.crpix[:, None] - 1
+    u = np.array(wcs.wcs_world2pix(*calibration.wcs(x, y), 0)) - origin
+    shift = [polynomial.polyval2d(*u, c) for c in (wcs.sip.ap, wcs.sip.bp)]
+    assert np.hypot(*(u + shift + origin - [x, y])).max() < 0.05
+    with pytest.raises(FileFormatError, match="must be TAN or TPV.*got 'RA---TAN-SIP'"):
+        read(tmp_path / "a.fits")
+    starting = read_wcs(tmp_path / "a.fits")
+    assert distance(calibration, starting.pixel_to_world_values(x, y)) <= 1.01 * worst + 1e-6
+
+
+def test_sip_tells_what_it_cannot(tmp_path, calibration):
+    worst = write(calibration, tmp_path / "a.fits", format="sip")
+    assert 1e-3 < worst < 0.5
+    assert f"{worst:.3g} px" in "".join(fits.getheader(tmp_path / "a.fits")["HISTORY"])
+
+
+def test_solution_stands_about_its_pointing(tmp_path, calibration):
+    solution = calibration.solution
+    write(solution, tmp_path / "a.fits")
+    back = read(tmp_path / "a.fits")
+    x, y = grid(calibration)
+    np.testing.assert_array_equal(back.wcs(x, y), solution.wcs(x, y))
+    assert write(solution, tmp_path / "b.fits", format="cpdis") < 1e-3
+
+
+def spoiled_fits(tmp_path, calibration, edit):
+    write(calibration, tmp_path / "a.fits", overwrite=True)
+    with fits.open(tmp_path / "a.fits") as hdus:
+        edit(hdus)
+        hdus.writeto(tmp_path / "b.fits", overwrite=True)
+    return tmp_path / "b.fits"
+
+
+class TestBadFits:
+    def test_unequal_spacing(self, tmp_path, calibration):
+        def edit(hdus):
+            x = hdus["WPDC_LUT"].data["X_GRID"]
+            x[x == np.unique(x)[3]] += 1.0
+
+        with pytest.raises(FileFormatError, match=r"b.fits\[WPDC_LUT\]: x_grid must be .*equally"):
+            read(spoiled_fits(tmp_path, calibration, edit))
+
+    def test_nan_nodes(self, tmp_path, calibration):
+        def edit(hdus):
+            hdus["WPDC_LUT"].data["DY_LUT"][5] = np.nan
+
+        with pytest.raises(FileFormatError, match="dy must be finite at every node; 1"):
+            read(spoiled_fits(tmp_path, calibration, edit))
+
+    def test_incomplete_grid(self, tmp_path, calibration):
+        def edit(hdus):
+            hdus["WPDC_LUT"].data = hdus["WPDC_LUT"].data[:-1]
+
+        with pytest.raises(FileFormatError, match="full grid.*got 155 rows"):
+            read(spoiled_fits(tmp_path, calibration, edit))
+
+    def test_shuffled_grid(self, tmp_path, calibration):
+        def edit(hdus):
+            hdus["WPDC_LUT"].data = hdus["WPDC_LUT"].data[::-1].copy()
+
+        with pytest.raises(FileFormatError, match="x running fastest"):
+            read(spoiled_fits(tmp_path, calibration, edit))
+
+    def test_missing_column(self, tmp_path, calibration):
+        def edit(hdus):
+            hdus["WPDC_LUT"].columns.del_col("DX_LUT")
+
+        with pytest.raises(FileFormatError, match="column DX_LUT is missing"):
+            read(spoiled_fits(tmp_path, calibration, edit))
+
+    def test_newer_version(self, tmp_path, calibration):
+        def edit(hdus):
+            hdus[0].header["WPDCVERS"] = "1.1"
+
+        with pytest.raises(FileFormatError, match="must not be newer than 1.0, got 1.1"):
+            read(spoiled_fits(tmp_path, calibration, edit))
+
+    @pytest.mark.parametrize("part", [0.01, 0.2, 0.7, 0.9])
+    def test_truncated(self, tmp_path, calibration, part):
+        write(calibration, tmp_path / "a.fits")
+        data = (tmp_path / "a.fits").read_bytes()
+        (tmp_path / "b.fits").write_bytes(data[: int(len(data) * part)])
+        with pytest.raises(FileFormatError, match=r"b.fits: truncated file"):
+            read(tmp_path / "b.fits")
+
+    def test_no_header(self, tmp_path):
+        fits.writeto(tmp_path / "a.fits", np.zeros((2, 2)))
+        with pytest.raises(FileFormatError, match="must hold a header with CTYPE1"):
+            read(tmp_path / "a.fits")
+
+    def test_several_headers(self, tmp_path, calibration):
+        write(calibration, tmp_path / "a.fits")
+        header = fits.getheader(tmp_path / "a.fits")
+        images = [fits.ImageHDU(np.zeros((2, 2)), header, name=n) for n in ("A", "B")]
+        fits.HDUList([fits.PrimaryHDU(), *images]).writeto(tmp_path / "b.fits")
+        for reader in (read, read_wcs):
+            with pytest.raises(FileFormatError, match="has 2 WCS headers; choose one"):
+                reader(tmp_path / "b.fits")
+        # The image says its own shape.
+        assert read(f"{tmp_path / 'b.fits'}[B]").solution.image_shape == (2, 2)
+        assert read_wcs(f"{tmp_path / 'b.fits'}[1]").pixel_shape == (2, 2)
+
+
+# --- one way in, one way out --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("no.asdf", None, "must be a readable file: No such file"),
+        ("a.asdf", b"", "must not be empty"),
+        ("a.fits", b"hello", "must begin with 'SIMPLE  ='"),
+        ("a.head", b"hello\nworld\n", "must hold a header with CTYPE1"),
+        ("a.fits.gz", b"\x1f\x8bxxxxxxxxx", "damaged gzip file"),
+    ],
+)
+@pytest.mark.parametrize("reader", [read, read_wcs])
+def test_unreadable(tmp_path, reader, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(FileFormatError, match=f"{name}: .*{message}"):
+        reader(tmp_path / name)
+
+
+def test_format_by_ending_and_by_name(tmp_path, calibration):
+    with pytest.raises(ValueError, match="format must be one of asdf, fits, .*got 'png'"):
+        write(calibration, tmp_path / "a.asdf", format="png")
+    with pytest.raises(ValueError, match="got None for .*a.xyz"):
+        write(calibration, tmp_path / "a.xyz")
+    with pytest.raises(TypeError, match="must be a Calibration or a DistortionSolution, got dict"):
+        write({}, tmp_path / "a.fits")
+    write(Table({"x": [1.0]}), tmp_path / "t.ecsv")
+    with pytest.raises(ValueError, match="written as 'ecsv', got the format 'fits'"):
+        write(Table({"x": [1.0]}), tmp_path / "t.fits")
+    assert sorted(os.listdir(tmp_path)) == ["t.ecsv"]
+
+
+@pytest.mark.parametrize("format", ["asdf", "fits", "cpdis", "head", "sip", "stock"])
+def test_existing_files_are_kept(tmp_path, calibration, format):
+    path = tmp_path / "a.out"
+    path.write_text("precious")
+    with pytest.raises(OutputExistsError, match="a.out: file exists"):
+        write(calibration, path, format=format)
+    with pytest.raises(InputError):
+        write(calibration, path, format=format)
+    with pytest.raises(FileExistsError):
+        write(calibration, path, format=format)
+    assert path.read_text() == "precious"
+    write(calibration, path, format=format, overwrite=True)
+    assert path.read_bytes() != b"precious"
+    assert os.listdir(tmp_path) == ["a.out"]
+
+
+@pytest.mark.parametrize("format", ["asdf", "fits"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError("disk full")])
+def test_nothing_is_left_of_a_write_that_fails(tmp_path, calibration, monkeypatch, format, error):
+    (tmp_path / "a.out").write_text("precious")
+    target = {"asdf": "asdf.AsdfFile.write_to", "fits": "astropy.io.fits.HDUList.writeto"}[format]
+
+    def half(self, path, **options):
+        with open(path, "wb") as file:
+            file.write(b"half")
+        raise error
+
+    monkeypatch.setattr(target, half)
+    raised = KeyboardInterrupt if error is KeyboardInterrupt else InputError
+    with pytest.raises(raised):
+        write(calibration, tmp_path / "a.out", format=format, overwrite=True)
+    assert os.listdir(tmp_path) == ["a.out"]
+    assert (tmp_path / "a.out").read_text() == "precious"
+
+
+# --- real headers -------------------------------------------------------------------------------
+
+
+def plain_headers(path):
+    """Headers of a conformance file as astropy gets them: not through this package."""
+    data = path.read_bytes()
+    if data[:9] == b"SIMPLE  =" and path.suffix in (".fits", ".wcs"):
+        with fits.open(path) as hdus:
+            return [h.header.copy() for h in hdus if "CTYPE1" in h.header]
+    lines = data.decode("latin-1").splitlines()
+    if len(lines) < 3:
+        lines = [lines[0][i : i + 80] for i in range(0, len(lines[0]), 80)]
+    keep = [
+        line[:80].encode("ascii", "replace").decode()
+        for line in lines
+        if line[8:9] == "=" and not line.startswith("#")
+    ]
+    return [fits.Header([fits.Card.fromstring(line) for line in keep])]
+
+
+CONFORMANCE = [
+    "galsim_fits_registry/tpv.fits",
+    "galsim_fits_registry/tanpv.fits",
+    "galsim_fits_registry/tpv_odd.fits",
+    "galsim_fits_registry/tanflip.fits",
+    "galsim_fits_registry/DECam_00154912_12_header.fits",
+    "galsim_fits_registry/scamp.head",
+    "scamp_heads/example_scamp.head",
+    "scamp_heads/example_externcat_scamp.head",
+    "scamp_heads/example_externcat_scamp_tpv.head",
+    "scamp_heads/wircam_scamp1.6.2_RA---TAN_PV.head.txt",
+    "sip_tpv/PTF_r_chip01_tpv.txt",
+    "astropy/tpvonly.hdr",
+    "wcslib_keyrec/TPV3.keyrec",
+    "wcslib_keyrec/TPV5.keyrec",
+    "wcslib_keyrec/TPV7.keyrec",
+]
+
+
+def compare_with_astropy(header, ours):
+    header = header.copy()
+    if "CD1_1" not in header and "TPV" in header["CTYPE1"]:
+        # astropy.wcs drops TPV distortions where the linear part is a bare CDELT.
+        for i in (1, 2):
+            header[f"CD{i}_{i}"] = header.pop(f"CDELT{i}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        theirs = WCS(header)
+    nx, ny = (max(int(header.get(f"NAXIS{i}", 0)), 2048) for i in (1, 2))
+    x, y = (v.ravel() for v in np.meshgrid(np.linspace(0, nx, 21), np.linspace(0, ny, 21)))
+    world = theirs.all_pix2world(np.column_stack([x, y]), 0)
+    expected = world[:, theirs.wcs.lng], world[:, theirs.wcs.lat]
+    got = ours(x, y, with_bounding_box=False)
+    center = [header["CRVAL1"], header["CRVAL2"]]
+    if theirs.wcs.lng == 1:
+        center = center[::-1]
+    difference = np.subtract(project(*got, center), project(*expected, center))
+    linear = theirs.pixel_scale_matrix
+    if theirs.wcs.lng == 1:
+        linear = linear[::-1]
+    return np.hypot(*np.linalg.solve(linear, difference)).max()
+
+
+@pytest.mark.parametrize("name", CONFORMANCE)
+def test_conformance_headers(shared_data, name):
+    path = shared_data / "wcs_headers" / "conformance" / name
+    (header,) = plain_headers(path)
+    assert compare_with_astropy(header, read_wcs(path)) < 1e-6
+
+
+def test_survey_headers(shared_data):
+    folder = shared_data / "wcs_headers" / "legacysurvey"
+    count = 0
+    for path in sorted([*folder.glob("90prime/*.fits"), *folder.glob("*.wcs")]):
+        with fits.open(path) as hdus:
+            numbers = [i for i, h in enumerate(hdus) if "CTYPE1" in h.header]
+            headers = [hdus[i].header.copy() for i in numbers]
+        for number, header in zip(numbers[-3:], headers[-3:], strict=True):
+            assert compare_with_astropy(header, read_wcs(f"{path}[{number}]")) < 1e-6, path
+            count += 1
+    assert count > 30
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "astropy/sip.fits",
+        "astropy/siponly.hdr",
+        "astropy/too_many_pv.hdr",
+        "galsim_fits_registry/sipsample.fits",
+        "sip_tpv/IRAC_3.6um_sip.txt",
+        "wcslib_keyrec/SIP.keyrec",
+    ],
+)
+def test_sip_headers(shared_data, name):
+    path = shared_data / "wcs_headers" / "conformance" / name
+    ours = read_wcs(path)
+    (header,) = plain_headers(path)
+    for key in [k for k in header if k.startswith("PV")]:
+        del header[key]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        theirs = WCS(header, naxis=2)
+    x, y = np.meshgrid(np.linspace(0, 2000, 11), np.linspace(0, 2000, 11))
+    np.testing.assert_allclose(
+        ours.pixel_to_world_values(x, y), theirs.all_pix2world(x, y, 0), rtol=1e-12
+    )
+
+
+def test_lookup_tables_of_astropy(shared_data):
+    """SIP, CPDIS and D2IM together, from a compressed file."""
+    path = shared_data / "wcs_headers" / "conformance" / "astropy" / "dist_lookup.fits.gz"
+    ours = read_wcs(path)
+    with warnings.catch_warnings(), fits.open(path) as hdus:
+        warnings.simplefilter("ignore")
+        theirs = WCS(hdus[1].header, hdus)
+        expected = theirs.all_pix2world([10.0, 50.0], [20.0, 70.0], 0)
+    np.testing.assert_allclose(ours.pixel_to_world_values([10.0, 50.0], [20.0, 70.0]), expected)
+
+
+def test_older_files_keep_opening():
+    """A file of every released format version."""
+    folder = os.path.join(os.path.dirname(__file__), "data")
+    names = [n for n in sorted(os.listdir(folder)) if n.startswith("calibration-")]
+    assert f"calibration-{FORMAT_VERSION}.asdf" in names
+    for name in names:
+        calibration = read(os.path.join(folder, name))
+        x, y = grid(calibration, n=5)
+        assert np.isfinite(calibration.wcs(x, y)).all()
+        twin = build_wcs(
+            crpix=calibration.solution.crpix,
+            cd=calibration.cd,
+            crval=calibration.crval,
+            pv=calibration.solution.pv,
+            pv_cd=calibration.solution.cd,
+            lookup_table=calibration.solution.lookup_table,
+        )
+        np.testing.assert_array_equal(twin(x, y), calibration.wcs(x, y))
