@@ -106,6 +106,19 @@ _GAIA_EPOCHS = (
     (re.compile(r"gaia\s*[-_/]?\s*dr1|I[/_]337"), 2015.0),
 )
 _ASSUMED_EPOCH = 2016.0
+_FITS_NAME = re.compile(r"\.(fits?|fts|fz)(\.gz)?$", re.IGNORECASE)
+# Endings that tell the format; None where astropy finds out by itself.
+_FORMATS = (
+    (".ecsv", "ascii.ecsv"),
+    (".csv", "ascii.csv"),
+    (".vot", "votable"),
+    (".parquet", "parquet"),
+    (".xml", None),
+    (".h5", None),
+    (".hdf5", None),
+    (".html", None),
+    (".asdf", None),
+)
 _MARK = "wpdc_catalog"
 # What the readers of astropy raise on damaged or foreign files.
 _READ_ERRORS = (
@@ -309,7 +322,11 @@ def _read_table(path, format):
                 return _read_fits_table(path, extension)
             if extension is not None:
                 raise CatalogError(f"{path}[{extension}]: only FITS files have extensions")
-            return Table.read(path, format=_format_of(path, format))
+            if format is None and _FITS_NAME.search(path.name):
+                raise CatalogError(
+                    f"{path}: a FITS file must begin with 'SIMPLE  =', this one does not"
+                )
+            return Table.read(path, format=format or table_format(path))
     except CatalogError:
         raise
     except _READ_ERRORS as error:
@@ -337,26 +354,23 @@ def _is_fits(path):
     return start == b"SIMPLE  =" or bool(compressed)
 
 
-def _format_of(path, format):
-    """Name the format where astropy would have to guess from content alone."""
-    if format is not None:
-        return format
+def table_format(path):
+    """Name the format of a table for `astropy.table.Table.read`.
+
+    Parameters
+    ----------
+    path : `~pathlib.Path`
+        Its name decides.
+
+    Returns
+    -------
+    format : str or None
+        ``"ascii"``, astropy's guess, where the ending says nothing; `None` where astropy knows it.
+    """
     suffixes = "".join(path.suffixes[-2:]).lower()
-    for ending, name in (
-        (".ecsv", "ascii.ecsv"),
-        (".csv", "ascii.csv"),
-        (".vot", "votable"),
-        (".parquet", "parquet"),
-        (".xml", None),
-        (".h5", None),
-        (".hdf5", None),
-        (".html", None),
-        (".asdf", None),
-    ):
+    for ending, name in _FORMATS:
         if ending in suffixes:
             return name
-    if re.search(r"\.(fits?|fts|fz)(\.gz)?$", path.name.lower()):
-        raise CatalogError(f"{path}: a FITS file must begin with 'SIMPLE  =', this one does not")
     return "ascii"
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 
+from wpdc_gwcs.catalogs import table_format
 from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.io.dates import header_epoch
@@ -380,9 +381,7 @@ def _read_text_table(path, wcs, detector, stem, image_shape):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            suffix = path.suffix.lower()
-            form = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv"}.get(suffix, "ascii")
-            table = Table.read(path, format=form)
+            table = Table.read(path, format=table_format(path))
     except READ_ERRORS as problem:
         raise FrameError(
             f"{path}: neither FITS nor a readable table of sources: {first_line(problem)}"

@@ -1,19 +1,22 @@
 """Tables of matches, sources and frames as ECSV, written in one step and fast."""
 
-import csv
 import io
+import re
 import warnings
 from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
 
+from wpdc_gwcs.catalogs import table_format
 from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.files import READ_ERRORS, atomic_path, file_kind, first_line
 
 __all__ = ["read_matches", "read_table", "write_table"]
 
-_FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv"}
+
+# What has to stand in quotes in a field.
+_SPECIAL = re.compile(r'[\s"#]')
 
 
 def write_table(table, path, *, overwrite=False):
@@ -75,11 +78,11 @@ def read_table(path, *, columns=()):
     """
     path = Path(path)
     kind = file_kind(path)
-    form = _FORMATS.get(path.suffix.lower())
+    form = "fits" if kind == "fits" else table_format(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            table = Table.read(path, format="fits" if kind == "fits" else form)
+            table = Table.read(path, format=form)
     except READ_ERRORS as problem:
         raise FileFormatError(f"{path}: not a readable table: {first_line(problem)}") from problem
     for column in columns:
@@ -122,18 +125,21 @@ def _text_of(table):
 
 
 def _rows_of(table):
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, delimiter=" ", lineterminator="\n")
-    writer.writerows(zip(*(_cells(column) for column in table.itercols()), strict=True))
-    return buffer.getvalue()
+    columns = [_cells(column) for column in table.itercols()]
+    return "".join(" ".join(row) + "\n" for row in zip(*columns, strict=True))
 
 
 def _cells(column):
     values = np.asarray(column)
-    if values.dtype.kind == "f":
-        # repr is the shortest text that reads back to the same float64; narrower types have their
-        # own.
-        return values.tolist() if values.dtype.itemsize == 8 else values.astype(str).tolist()
-    if values.dtype.kind == "b":
+    if values.dtype.kind == "f" and values.dtype.itemsize == 8:
+        # The shortest text that reads back to the same number.
+        return map(repr, values.tolist())
+    if values.dtype.kind in "biuf":
         return values.astype(str).tolist()
-    return values.tolist()
+    return [_quoted(str(value)) for value in values.tolist()]
+
+
+def _quoted(text):
+    if text and not _SPECIAL.search(text):
+        return text
+    return '"' + text.replace('"', '""') + '"'
