@@ -1,0 +1,260 @@
+"""Speed and accuracy of the WCS beside astropy.wcs, the stock gwcs and the memory itself.
+
+Run from the root of the project::
+
+    python benchmarks/wcs_speed.py            # up to 1e7 points, map of 9216 x 9232
+    python benchmarks/wcs_speed.py --full     # up to 1e8 points
+    python benchmarks/wcs_speed.py --quick    # up to 1e6 points, small map
+
+Every ratio is taken within one process, the two sides in turn, best of several runs.
+"""
+
+import argparse
+import resource
+import subprocess
+import sys
+import time
+
+import numpy as np
+from astropy.wcs import WCS, DistortionLookupTable
+
+from wpdc_gwcs.models import DistortionCorrection, LookupTable, PVPolynomial, project, pv_terms
+from wpdc_gwcs.wcs import build_wcs, sky_map, to_stock_wcs
+
+NX, NY = 9216, 9232
+SCALE = 0.074 / 3600
+CORNER_PX = 200.0
+CPDIS_NODES = 401
+
+
+def make_wcs(crval=(120.0, 30.0), roll=10.0, shape=(NY, NX), seed=1):
+    """Build a WCS with 200 px of distortion and a 50 x 50 cubic table of 0.1 px."""
+    rng = np.random.default_rng(seed)
+    ny, nx = shape
+    crpix = ((nx - 1) / 2, (ny - 1) / 2)
+    c, s = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    cd = SCALE * np.array([[-c, s], [s, c]])
+    half = SCALE * nx / 2
+    terms = pv_terms(3)
+    coefficients = rng.normal(size=(2, 10)) / half ** (terms.own + terms.other - 1.0)
+    coefficients[:, terms.own + terms.other < 2] = 0.0
+    corners = half * np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]])
+    largest = np.hypot(*PVPolynomial.from_coefficients(coefficients)(*corners)).max()
+    coefficients *= CORNER_PX * SCALE / largest
+    coefficients[:, 1] += 1.0
+    x, y = np.linspace(-0.5, nx - 0.5, 50), np.linspace(-0.5, ny - 0.5, 50)
+    gx, gy = np.meshgrid(x, y)
+    dx, dy = (
+        0.1 * np.sin(2 * np.pi * (a * gx + b * gy) / 2000 + phase)
+        for a, b, phase in rng.normal(size=(2, 3))
+    )
+    return build_wcs(
+        crpix=crpix,
+        cd=cd,
+        crval=crval,
+        pv=PVPolynomial.from_coefficients(coefficients),
+        lookup_table=LookupTable(x, y, dx, dy),
+        image_shape=shape,
+    )
+
+
+def make_cpdis(wcs):
+    """Build the same WCS for plain astropy.wcs: TPV after look-up tables of Paper IV."""
+    distortion, sky = (step.transform for step in wcs.pipeline[:-1])
+    nx, ny = wcs.pixel_shape
+    polynomial = DistortionCorrection(distortion.crpix.value, distortion.cd.value, distortion.pv)
+    x, y = np.linspace(-0.5, nx - 0.5, CPDIS_NODES), np.linspace(-0.5, ny - 0.5, CPDIS_NODES)
+    gx, gy = np.meshgrid(x, y)
+    # The tables act before the polynomial, ours after it: carried through the polynomial's inverse.
+    moved = polynomial.inverse(*distortion(gx, gy))
+    result = WCS(naxis=2)
+    result.wcs.ctype = ["RA---TPV", "DEC--TPV"]
+    result.wcs.crpix = sky.crpix.value + 1
+    result.wcs.cd = sky.cd.value
+    result.wcs.crval = sky.crval.value
+    pv = distortion.pv
+    result.wcs.set_pv(
+        [
+            (i + 1, int(j), pv.coefficients[i, k])
+            for i in (0, 1)
+            for k, j in enumerate(pv.term_indices)
+        ]
+    )
+    step = (x[1] - x[0], y[1] - y[0])
+    tables = [
+        DistortionLookupTable(
+            (new - old).astype(np.float32), (1.0, 1.0), (x[0] + 1, y[0] + 1), step
+        )
+        for new, old in zip(moved, (gx, gy), strict=True)
+    ]
+    result.cpdis1, result.cpdis2 = tables
+    result.wcs.set()
+    return result
+
+
+def seconds(function, *, budget=1.0, repeat=5):
+    """Return the best time of several runs that take about the budget together."""
+    best = np.inf
+    spent = 0.0
+    for run in range(repeat):
+        start = time.perf_counter()
+        function()
+        elapsed = time.perf_counter() - start
+        best = min(best, elapsed)
+        spent += elapsed
+        if spent > budget and run > 0:
+            break
+    return best
+
+
+def copy_limit(x, y):
+    """Read the inputs and write the outputs, and nothing else."""
+    a, b = np.empty_like(x), np.empty_like(y)
+    a[:] = x
+    b[:] = y
+    return a, b
+
+
+def print_forward(wcs, stock, reference, sizes, rng):
+    """Print nanoseconds per point of the forward direction."""
+    print("\nforward, ns per point")
+    names = ("wcs(x, y)", "no box", "astropy.wcs", "stock gwcs", "copy")
+    print(f"{'points':>10} " + " ".join(f"{name:>12}" for name in names) + "    ratios to astropy")
+    for n in sizes:
+        x, y = rng.uniform(0, NX - 1, n), rng.uniform(0, NY - 1, n)
+        if n == 1:
+            x, y = float(x[0]), float(y[0])
+        runs = [
+            lambda x=x, y=y: wcs(x, y),
+            lambda x=x, y=y: wcs(x, y, with_bounding_box=False),
+            lambda x=x, y=y: reference.all_pix2world(x, y, 0),
+            (lambda x=x, y=y: stock(x, y)) if n <= 1_000_000 else None,
+            lambda x=x, y=y: copy_limit(np.atleast_1d(x), np.atleast_1d(y)),
+        ]
+        times = [np.nan if run is None else seconds(run) / n * 1e9 for run in runs]
+        ratios = f"{times[2] / times[0]:.1f} {times[2] / times[1]:.1f}"
+        print(f"{n:>10} " + " ".join(f"{t:>12.1f}" for t in times) + f"    {ratios}")
+
+
+def print_inverse(wcs, stock, reference, sizes, rng):
+    """Print nanoseconds per point of the inverse direction."""
+    print("\ninverse, ns per point (astropy.wcs: all_world2pix, tolerance 1e-6)")
+    names = ("wcs.invert", "astropy.wcs", "stock gwcs")
+    print(f"{'points':>10} " + " ".join(f"{name:>12}" for name in names) + "    ratio to astropy")
+    for n in sizes:
+        sky = wcs(rng.uniform(0, NX - 1, n), rng.uniform(0, NY - 1, n))
+        if n == 1:
+            sky = tuple(float(value[0]) for value in sky)
+        runs = [
+            lambda sky=sky: wcs.invert(*sky),
+            lambda sky=sky: reference.all_world2pix(*sky, 0, tolerance=1e-6, maxiter=50),
+            (lambda sky=sky: stock.invert(*sky)) if n <= 200_000 else None,
+        ]
+        times = [np.nan if run is None else seconds(run) / n * 1e9 for run in runs]
+        ratio = f"{times[1] / times[0]:.1f}"
+        print(f"{n:>10} " + " ".join(f"{t:>12.1f}" for t in times) + f"    {ratio}")
+
+
+def print_scalar(wcs, stock):
+    """Print milliseconds per scalar call."""
+    sky = wcs(100.0, 200.0)
+
+    def milliseconds(function, n=200):
+        return seconds(lambda: [function() for _ in range(n)], repeat=3) / n * 1e3
+
+    print("\nscalar call, ms")
+    print(f"  wcs(x, y)   {milliseconds(lambda: wcs(100.0, 200.0)):8.3f}")
+    print(f"  wcs.invert  {milliseconds(lambda: wcs.invert(*sky)):8.3f}")
+    print(f"  stock gwcs  {milliseconds(lambda: stock(100.0, 200.0), 20):8.3f}")
+
+
+def print_map(wcs, reference, shape):
+    """Print the time of a map of all pixels, and the memory it takes, in a process of its own."""
+    ny, nx = shape
+    n = ny * nx
+    start = time.perf_counter()
+    sky_map(wcs, image_shape=shape)
+    ours = time.perf_counter() - start
+    # astropy.wcs block by block as well: all at once it would need seven times the memory.
+    rows = max(1, 2_000_000 // nx)
+    out = np.empty((2, ny, nx))
+    start = time.perf_counter()
+    for first in range(0, ny, rows):
+        y, x = np.mgrid[first : min(first + rows, ny), :nx]
+        found = reference.all_pix2world(x.ravel(), y.ravel(), 0)
+        out[:, first : first + rows] = np.reshape(found, (2, -1, nx))
+    theirs = time.perf_counter() - start
+    print(f"\nmap of {nx} x {ny}: {ours:.2f} s ({ours / n * 1e9:.1f} ns per pixel)")
+    print(f"  astropy.wcs in blocks: {theirs:.2f} s, ratio {theirs / ours:.1f}")
+    command = [sys.executable, __file__, "--map-memory", str(ny), str(nx)]
+    print("  " + subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip())
+
+
+def print_map_memory(ny, nx):
+    """Print the peak memory of a map, beyond that of the libraries, relative to its outputs."""
+    wcs = make_wcs()
+    sky_map(wcs, image_shape=(100, 100))
+    # Kilobytes on Linux.
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    ra, dec = sky_map(wcs, image_shape=(ny, nx))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    outputs = ra.nbytes + dec.nbytes
+    print(
+        f"peak memory {peak / 1e6:.0f} MB, of it {before / 1e6:.0f} MB before the map: "
+        f"{peak / outputs:.2f} x its outputs ({(peak - before) / outputs:.2f} x without libraries)"
+    )
+
+
+def print_accuracy(wcs, stock, reference, rng):
+    """Print how exact the round trip and the other forms of the WCS are."""
+    x, y = rng.uniform(-0.5, NX - 0.5, 200_000), rng.uniform(-0.5, NY - 0.5, 200_000)
+    x[:1000], x[1000:2000], y[2000:3000], y[3000:4000] = -0.5, NX - 0.5, -0.5, NY - 0.5
+    print("\nround trip over the detector with its rim, px")
+    worst, lost = 0.0, 0
+    for crval in ((0.0, 0.0), (120.0, 30.0), (0.0, 89.9), (33.0, 90.0), (10.0, -90.0)):
+        for roll in (0.0, 77.0, 181.0):
+            camera = make_wcs(crval, roll)
+            found = np.array(camera.invert(*camera(x, y)))
+            lost += np.count_nonzero(~np.isfinite(found))
+            worst = max(worst, np.nanmax(np.abs(found - [x, y])))
+    print(f"  greatest error {worst:.1e}, NaN {lost}")
+    sky = wcs.pipeline[1].transform
+    to_px = np.linalg.inv(sky.cd.value)
+    x, y = x[:20_000], y[:20_000]
+    plane = np.array(project(*wcs(x, y), sky.crval.value))
+    for name, values in (
+        ("stock gwcs", stock(x, y)),
+        ("astropy.wcs, cpdis", reference.all_pix2world(x, y, 0)),
+    ):
+        error = to_px @ (np.array(project(*values, sky.crval.value)) - plane)
+        print(f"  {name} against wcs: {np.abs(error).max():.1e} px")
+    back = stock.invert(*wcs(x, y), with_bounding_box=False)
+    print(f"  stock inverse: {np.abs(np.subtract(back, (x, y))).max():.1e} px")
+
+
+def main():
+    """Print everything."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--full", action="store_true", help="up to 1e8 points (6 GB)")
+    parser.add_argument("--quick", action="store_true", help="up to 1e6 points, small map")
+    parser.add_argument("--map-memory", nargs=2, type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.map_memory:
+        print_map_memory(*options.map_memory)
+        return
+    rng = np.random.default_rng(0)
+    wcs = make_wcs()
+    stock = to_stock_wcs(wcs)
+    reference = make_cpdis(wcs)
+    largest = 1_000_000 if options.quick else 100_000_000 if options.full else 10_000_000
+    sizes = [1, 10, 100, 1000, 10_000, 100_000, 1_000_000, 2_000_000, 10_000_000, 100_000_000]
+    sizes = [n for n in sizes if n <= largest]
+    print_forward(wcs, stock, reference, sizes, rng)
+    print_inverse(wcs, stock, reference, [1, 1000, 200_000, min(largest, 1_000_000)], rng)
+    print_scalar(wcs, stock)
+    print_map(wcs, reference, (NY // 8, NX) if options.quick else (NY, NX))
+    print_accuracy(wcs, stock, reference, rng)
+
+
+if __name__ == "__main__":
+    main()
