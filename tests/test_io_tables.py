@@ -86,7 +86,7 @@ def test_speed(tmp_path):
     table = Table({f"c{i}": rng.normal(size=10000) for i in range(14)})
     start = time.perf_counter()
     write_table(table, tmp_path / "a.ecsv")
-    # 0.15 s on a machine at leisure; astropy's own writer takes some ten times as long.
+    # 0.15 s on a machine at leisure.
     assert time.perf_counter() - start < 3.0
 
 

@@ -318,7 +318,7 @@ def header_number(
         return default
     value = header_value(header, key)
     if isinstance(value, bool | str | complex) or value is None or not math.isfinite(value):
-        shown = repr(value) if value is not None else header.cards[key].image[9:].strip()
+        shown = "what cannot be parsed" if value is None else repr(value)
         raise error(f"{name}: card {key} must be a finite number, got {shown}")
     return float(value)
 
@@ -632,12 +632,11 @@ def _parse_other(header, hdus, name, error):
             warnings.simplefilter("ignore")
             wcs = WCS(header, fobj=hdus, naxis=2)
             wcs.wcs.set()
-    except WcsError as problem:
-        # wcslib says last what it is, after the places in its own code.
-        reason = str(problem).strip().split("\n")[-1]
+    except (WcsError, *READ_ERRORS) as problem:
+        # wcslib mixes what it is with the places in its own code.
+        lines = [line for line in str(problem).splitlines() if line and "ERROR" not in line]
+        reason = lines[-1] if lines else first_line(problem)
         raise error(f"{name}: not a usable WCS: {reason}") from problem
-    except READ_ERRORS as problem:
-        raise error(f"{name}: not a usable WCS: {first_line(problem)}") from problem
     if not wcs.has_celestial:
         raise error(f"{name}: WCS must be celestial, got {list(wcs.wcs.ctype)}")
     if wcs.wcs.lng == 1:
