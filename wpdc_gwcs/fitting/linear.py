@@ -1,0 +1,81 @@
+"""Weighted linear least squares by QR and SVD."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from wpdc_gwcs.exceptions import FitError
+
+__all__ = ["LinearSolution", "robust_sigma", "solve_linear"]
+
+# Turns a median absolute deviation into the standard deviation of a normal distribution.
+_MAD_TO_SIGMA = 1.482602218505602
+
+
+class LinearSolution(NamedTuple):
+    """Weighted linear least squares, see `solve_linear`."""
+
+    parameters: np.ndarray
+    rank: int
+    condition: float
+    root: np.ndarray  # (p, p): root @ root.T = inverse of the weighted normal matrix
+    leverage: np.ndarray | None
+
+
+def solve_linear(design, target, weight=None, *, leverage=False):
+    """Minimise ``sum(weight * (target - design @ p)**2)`` by QR and SVD of scaled columns.
+
+    Parameters
+    ----------
+    design : (N, p) ndarray
+        Columns of the linear model.
+    target : (N,) or (N, k) ndarray
+        Values to be reproduced; several right-hand sides share the factorisation.
+    weight : (N,) ndarray, optional
+        Weight of the squared residual.
+    leverage : bool, optional
+        Also return the diagonal of the hat matrix.
+
+    Returns
+    -------
+    LinearSolution
+        Parameters ``(p,)`` or ``(p, k)``; rank and condition number of the scaled, weighted
+        columns.
+
+    Raises
+    ------
+    FitError
+        If there are fewer rows of non-zero weight than columns, or the columns are not independent.
+    """
+    n, p = design.shape
+    if weight is not None:
+        root_weight = np.sqrt(weight)
+        n = int(np.count_nonzero(root_weight))
+        design = design * root_weight[:, None]
+        target = target * (root_weight if target.ndim == 1 else root_weight[:, None])
+    if n < p:
+        raise FitError(f"{n} stars of non-zero weight cannot determine {p} coefficients")
+    scale = np.sqrt(np.einsum("ij,ij->j", design, design))
+    if not np.all(scale > 0):
+        raise FitError(
+            f"{int(np.sum(~(scale > 0)))} of {p} coefficients have no weight: the weights are "
+            "zero or vanish at the stars"
+        )
+    # QR first: the SVD is then of a small triangle, whatever the number of stars.
+    q, r = np.linalg.qr(design / scale)
+    u, s, vt = np.linalg.svd(r)
+    rank = int(np.sum(s > s[0] * p * np.finfo(float).eps))
+    if rank < p:
+        raise FitError(
+            f"the {n} stars determine only {rank} of {p} coefficients: they lie too close "
+            "together or on one line"
+        )
+    root = (vt.T / s) / scale[:, None]
+    parameters = root @ (u.T @ (q.T @ target))
+    hat = np.einsum("ij,ij->i", q, q) if leverage else None
+    return LinearSolution(parameters, rank, float(s[0] / s[-1]), root, hat)
+
+
+def robust_sigma(values):
+    """Scatter about zero that outliers do not move: 1.4826 times the median absolute value."""
+    return _MAD_TO_SIGMA * float(np.median(np.abs(values))) if len(values) else np.nan
