@@ -7,12 +7,9 @@ import numpy as np
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._mapping import MAX_ORDER, SmoothMap
-from wpdc_gwcs.matching._search import Limits, Search, Stars
+from wpdc_gwcs.matching._search import MIN_STARS, Limits, Search, Stars
 
 __all__ = ["match_planes"]
-
-# Fewer stars than this in either list cannot give evidence whatever they do.
-MIN_STARS = 8
 
 
 def match_planes(

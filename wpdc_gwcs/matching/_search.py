@@ -16,6 +16,7 @@ from wpdc_gwcs.matching._features import (
     neighbour_pattern,
     select_coherent,
 )
+from wpdc_gwcs.matching._local import LocalCorrection
 from wpdc_gwcs.matching._mapping import fit_smooth_map, scatter_of
 from wpdc_gwcs.matching._pairs import find_edges, one_to_one
 
@@ -23,13 +24,23 @@ __all__ = ["Limits", "Search", "Stars"]
 
 logger = logging.getLogger(__name__)
 
-# Sources of the bright subsets that are tried in turn; None stands for all.
-_LEVELS = (500, 2000, None)
+# Fewer stars than this in either list cannot give evidence whatever they do.
+MIN_STARS = 8
+
+# Sources of the bright subsets that are tried in turn; then all.
+_LEVELS = (500, 2000)
 # Reference stars per source in a subset: more, since the cuts in flux and magnitude never
 # correspond exactly.
 _REFERENCE_SURPLUS = 2.0
-# Stars to look up by their neighbourhood, first and second try.
-_ANCHORS = (48, 200)
+# Sources per star of the sparser list in a subset.
+_SOURCE_SURPLUS = 1.3
+# Stars to look up by their neighbourhood and neighbours to compare, first and second try.
+_TRIES = ((48, 12), (200, 24))
+# Groups of hypotheses that are followed up.
+_N_SEEDS = 8
+# Triples of pairs tried for a linear mapping, and the share of pairs that should follow it.
+_N_TRIPLES = 1000
+_AGREEING_SHARE = 0.2
 # Sources that take part in fits of the mapping: more would not make it better.
 _FIT_SAMPLE = 20_000
 # Pairing radius in units of the scatter: while the mapping grows, and in the end (chance to lose a
@@ -39,7 +50,11 @@ _FINAL_RADIUS = 5.5
 _SMALLEST_RADIUS = 0.05
 # A radius must not reach further than where this many stars are expected by chance.
 _MAX_CROWDING = 0.25
-_LOCAL_NEIGHBOURS = 16
+# Radius that may be used where stars are so sparse that 0.3 % are expected by chance within it.
+_WIDE_RADIUS = 20.0
+_HARMLESS = np.sqrt(0.003 / _MAX_CROWDING)
+# Clipping once the pairs are nearly pure, in units of the scatter.
+_LOOSE_CLIP = 50.0
 
 _HINT = (
     "if the header may be mirrored, turned by 90 degrees, off in scale by up to 5 % or off in "
@@ -116,6 +131,7 @@ class Search:
         self.shape, self.frame, self.limits, self.max_order = shape, frame, limits, max_order
         self.rules = {"min_significance": min_significance, "min_purity": min_purity}
         self.best_failure = None
+        self.seen = set()
 
     # starts
 
@@ -135,70 +151,85 @@ class Search:
         """Look stars up by their neighbourhoods, bright ones first."""
         turns = _orientations() if blind else [np.eye(2)]
         for rows_s, rows_r in self.subsets():
-            reference = self.stars if rows_r is None else Stars.build(self.stars.points[rows_r])
-            if rows_r is None:
-                rows_r = np.arange(len(reference.points))
+            reference = self.stars
+            if len(rows_r) < len(reference.points):
+                reference = Stars.build(reference.points[rows_r])
             subset = self.sources[rows_s]
-            tried = 0
-            for n_anchors in _ANCHORS:
-                if n_anchors != _ANCHORS[0] and tried >= len(subset):
-                    break
-                tried = n_anchors
+            for n_anchors, n_neighbours in _TRIES:
                 seeds = []
                 for turn in turns:
                     turned = (subset - self.frame.center) @ turn.T + self.frame.center
                     hypotheses, groups = self.seeds(
-                        turned, reference, self.flux_rank(rows_s), n_anchors
+                        turned, reference, self.flux_rank(rows_s), n_anchors, n_neighbours
                     )
                     seeds += [
                         (support, turn, turned, hypotheses.take(rows)) for support, rows in groups
                     ]
                 clock.lap("patterns")
                 seeds.sort(key=lambda seed: -seed[0])
-                for _, turn, turned, hypotheses in seeds[:8]:
-                    found = self.grow_from(turned, reference, hypotheses, clock)
-                    if found is None:
-                        continue
-                    i, j = found
-                    pairs = rows_s[i], rows_r[j]
-                    everything = (self.sources - self.frame.center) @ turn.T + self.frame.center
-                    found = self.finish(everything, pairs, clock)
+                for _, turn, turned, hypotheses in seeds[:_N_SEEDS]:
+                    found = self.try_group(
+                        turn, turned, rows_s, reference, rows_r, hypotheses, clock
+                    )
                     if found is not None:
                         self.check_header(found[0])
-                        return (
-                            _turn_mapping(found[0], turn),
-                            *found[1:],
-                            int(np.sign(np.linalg.det(turn))),
-                        )
+                        parity = int(np.sign(np.linalg.det(turn)))
+                        return _turn_mapping(found[0], turn), *found[1:], parity
         raise self.refusal(hint=not blind)
 
+    def try_group(self, turn, turned, rows_s, reference, rows_r, hypotheses, clock):
+        """Grow from a group of hypotheses: from all its pairs, from those that agree best, ..."""
+        for pairs in _first_pairs(turned, reference, hypotheses):
+            pairs = self.grow_from(turned, reference, pairs, clock)
+            if pairs is None:
+                continue
+            pairs = rows_s[pairs[0]], rows_r[pairs[1]]
+            key = hash((turn.tobytes(), pairs[0].tobytes(), pairs[1].tobytes()))
+            if key in self.seen:
+                continue
+            self.seen.add(key)
+            everything = (self.sources - self.frame.center) @ turn.T + self.frame.center
+            found = self.finish(everything, pairs, clock)
+            if found is not None:
+                return found
+        return None
+
     def subsets(self):
-        """Rows of sources and reference stars to try in turn, bright ones first."""
-        both = self.flux is not None and self.mag is not None
-        nx, ny = self.shape[1], self.shape[0]
-        x, y = self.stars.points.T
-        inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
-        for level in _LEVELS:
-            if level is None:
-                yield np.arange(len(self.sources)), None
-            elif both and level < 0.7 * len(self.sources):
-                rows_s = np.sort(np.argsort(-self.flux, kind="stable")[:level])
-                order = np.argsort(-self.mag, kind="stable")
-                wanted = _REFERENCE_SURPLUS * level
-                counted = np.cumsum(inside[order])
-                rows_r = np.sort(order[: int(np.searchsorted(counted, wanted)) + 1])
-                yield rows_s, rows_r
+        """Rows of sources and reference stars to try in turn, bright ones first.
+
+        A subset has about as many stars of either list as the sparser one has on the frame: what is
+        fainter than the limit of the other list can only disturb.
+        """
+        ny, nx = self.shape
+        everything = np.arange(len(self.sources)), np.arange(len(self.stars.points))
+        if self.flux is not None and self.mag is not None:
+            x, y = self.stars.points.T
+            inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
+            most = _SOURCE_SURPLUS * min(len(self.sources), max(np.count_nonzero(inside), 1))
+            by_flux = np.argsort(-self.flux, kind="stable")
+            by_mag = np.argsort(-self.mag, kind="stable")
+            counted = np.cumsum(inside[by_mag])
+            before = 0
+            for level in _LEVELS:
+                n = int(min(level, most))
+                last = int(np.searchsorted(counted, _REFERENCE_SURPLUS * n)) + 1
+                rows = np.sort(by_flux[:n]), np.sort(by_mag[:last])
+                size = len(rows[0]) + len(rows[1])
+                if n >= MIN_STARS and before < size < len(everything[0]) + len(everything[1]):
+                    yield rows
+                before = size
+        yield everything
 
     def flux_rank(self, rows):
         """Order in which stars are preferred as anchors; None without fluxes."""
         return None if self.flux is None else -self.flux[rows]
 
-    def seeds(self, sources, reference, rank, n_anchors):
+    def seeds(self, sources, reference, rank, n_anchors, n_neighbours):
         """Hypotheses for a spread of anchors and the groups among them that agree."""
         ratio, _, _ = density_ratio_map(*sources.T, *reference.points.T, self.shape)
         many, few = np.quantile(ratio, [0.75, 0.25])
-        n_source = int(min(MAX_NEIGHBOURS, np.ceil(N_NEIGHBOURS * max(1.0, many))))
-        n_reference = int(min(MAX_NEIGHBOURS, np.ceil(N_NEIGHBOURS * max(1.0, 1 / few))))
+        n_source = int(min(MAX_NEIGHBOURS, np.ceil(n_neighbours * max(1.0, many))))
+        n_reference = int(min(MAX_NEIGHBOURS, np.ceil(n_neighbours * max(1.0, 1 / few))))
         anchors = self.anchors(sources, rank, n_anchors)
         distance = np.hypot(*(sources[anchors] - self.frame.center).T)
         limits = self.limits
@@ -244,9 +275,8 @@ class Search:
 
     # growth
 
-    def grow_from(self, sources, reference, hypotheses, clock):
-        """Pairs of a subset that follow from a group of hypotheses, or None without evidence."""
-        pairs = _neighbour_pairs(sources, reference, hypotheses)
+    def grow_from(self, sources, reference, pairs, clock):
+        """Pairs of a subset that follow from first pairs, or None without evidence."""
         grown = self.grow(sources, reference, pairs)
         clock.lap("grow")
         if grown is None:
@@ -277,13 +307,7 @@ class Search:
         result = None
         for _ in range(rounds):
             i, j = pairs
-            fit = fit_smooth_map(
-                *sources[i].T,
-                *reference.points[j].T,
-                center=self.frame.center,
-                scale=self.frame.scale,
-                max_order=self.max_order,
-            )
+            fit = self.fit(sources[i], reference.points[j])
             if fit is None:
                 return result
             mapped = np.column_stack(fit.mapping(*sources.T))
@@ -303,13 +327,7 @@ class Search:
     def finish(self, sources, pairs, clock):
         """Grow over all stars, pair with the final radius, judge; None without evidence."""
         step = max(1, -(-len(sources) // _FIT_SAMPLE))
-        fit = fit_smooth_map(
-            *sources[pairs[0]].T,
-            *self.stars.points[pairs[1]].T,
-            center=self.frame.center,
-            scale=self.frame.scale,
-            max_order=self.max_order,
-        )
+        fit = self.fit(sources[pairs[0]], self.stars.points[pairs[1]])
         if fit is None:
             return None
         part = np.arange(0, len(sources), step)
@@ -324,11 +342,10 @@ class Search:
         clock.lap("refine")
         if grown is None:
             return None
-        fit, (i, j), _, _ = grown
-        i = part[i]
-        mapped = np.column_stack(fit.mapping(*sources.T))
-        mapped, scatter = _correct_locally(sources, mapped, self.stars.points, (i, j), fit.scatter)
-        radius = self.final_radius(mapped, (i, j), scatter)
+        fit, local, pairs, scatter = self.grow_locally(sources[part], *grown[:2])
+        clock.lap("refine")
+        mapped, leverage = _predict(sources, fit, local)
+        radius = self.final_radius(mapped, (part[pairs[0]], pairs[1]), scatter, leverage)
         i, j, _ = find_edges(mapped, self.stars.tree, radius, limit=self.stars.limit)
         keep, n_ambiguous = one_to_one(i, j, len(sources), len(self.stars.points))
         pairs = i[keep], j[keep]
@@ -350,21 +367,66 @@ class Search:
             return None
         return fit.mapping, evidence, pairs, n_ambiguous, scatter, float(np.median(radius))
 
-    def final_radius(self, mapped, pairs, scatter):
-        """Radius of every source from its own error, scaled to the scatter that is seen."""
-        i, j = pairs
-        if self.errors is None:
-            return np.full(len(mapped), max(_SMALLEST_RADIUS, _FINAL_RADIUS * scatter))
-        difference = mapped[i] - self.stars.points[j]
-        error = self.errors[i]
-        # what the errors do not explain is the same for all: take it from the stars with small
-        # errors
-        small = error <= np.quantile(error, 0.3)
-        floor = max(0.0, scatter_of(*difference[small].T) ** 2 - np.median(error[small]) ** 2)
-        factor = scatter_of(*(difference / np.sqrt(error**2 + floor)[:, None]).T)
-        return np.maximum(
-            _SMALLEST_RADIUS, _FINAL_RADIUS * factor * np.sqrt(self.errors**2 + floor)
+    def grow_locally(self, sources, fit, pairs, *, rounds=12):
+        """Take off what neighbouring pairs have in common, and pair again until the pairs stay.
+
+        The pairs are nearly pure by now, so the polynomial is fitted without clipping: clipping
+        would keep it from following where the distortion is steepest, in the corners.
+        """
+        limit_s = _crowding_limit(sources, cKDTree(sources))
+        scatter, local, before = fit.scatter, None, None
+        for _ in range(rounds):
+            i, j = pairs
+            fit = self.fit(sources[i], self.stars.points[j], clip=_LOOSE_CLIP) or fit
+            residual = self.stars.points[j] - np.column_stack(fit.mapping(*sources[i].T))
+            local = LocalCorrection.if_worthwhile(sources[i], residual)
+            scatter = fit.scatter
+            if local is not None:
+                scatter = scatter_of(*(residual - local(sources[i], leave_out=True)[0]).T)
+            mapped, leverage = _predict(sources, fit, local)
+            error = scatter * np.sqrt(1 + leverage)
+            # where stars are sparse a wider radius costs nothing, and lets the mapping follow what
+            # it could not foresee
+            near = self.stars.tree.query(mapped, workers=2)[1]
+            harmless = _HARMLESS * np.minimum(limit_s, self.stars.limit[near])
+            radius = np.maximum(_GROW_RADIUS * error, np.minimum(_WIDE_RADIUS * error, harmless))
+            radius = np.maximum(radius, _SMALLEST_RADIUS)
+            radius[radius > limit_s] = 0.0
+            i, j, _ = find_edges(mapped, self.stars.tree, radius, limit=self.stars.limit)
+            keep, _ = one_to_one(i, j, len(sources), len(self.stars.points))
+            pairs = i[keep], j[keep]
+            key = hash((pairs[0].tobytes(), pairs[1].tobytes()))
+            if key == before:
+                break
+            before = key
+        return fit, local, pairs, scatter
+
+    def fit(self, points, reference, **options):
+        """Fit a smooth mapping in the frame's own units."""
+        return fit_smooth_map(
+            *points.T,
+            *reference.T,
+            center=self.frame.center,
+            scale=self.frame.scale,
+            max_order=self.max_order,
+            **options,
         )
+
+    def final_radius(self, mapped, pairs, scatter, leverage):
+        """Radius of every source from its own error and that of the mapping where it stands."""
+        if self.errors is None:
+            own = np.full(len(mapped), scatter)
+        else:
+            i, j = pairs
+            difference = mapped[i] - self.stars.points[j]
+            error = self.errors[i]
+            # what the errors do not explain is the same for all: take it from the best stars
+            small = error <= np.quantile(error, 0.3)
+            floor = max(0.0, scatter_of(*difference[small].T) ** 2 - np.median(error[small]) ** 2)
+            factor = scatter_of(*(difference / np.sqrt(error**2 + floor)[:, None]).T)
+            own = factor * np.sqrt(self.errors**2 + floor)
+        radius = _FINAL_RADIUS * np.sqrt(own**2 + scatter**2 * leverage)
+        return np.maximum(radius, _SMALLEST_RADIUS)
 
     # refusals
 
@@ -438,6 +500,41 @@ def _turn_mapping(mapping, turn):
     return fit.mapping
 
 
+def _first_pairs(sources, reference, hypotheses):
+    """List sets of pairs to start from, the most promising first."""
+    pairs = _neighbour_pairs(sources, reference, hypotheses)
+    yield pairs
+    if len(hypotheses) > 1:
+        agreeing = _agreeing_pairs(sources, reference.points, pairs)
+        if agreeing is not None:
+            yield agreeing
+        yield _neighbour_pairs(sources, reference, hypotheses.take(slice(0, 1)))
+
+
+def _agreeing_pairs(sources, reference, pairs):
+    """Pairs that follow one linear mapping best, by the least quantile of the residuals.
+
+    Finds the right pairs where they are a minority, which least squares with clipping does not.
+    """
+    i, j = pairs
+    if len(i) < 6:
+        return None
+    rng = np.random.default_rng(len(i))
+    triples = rng.integers(len(i), size=(_N_TRIPLES, 3))
+    at, to = sources[i], reference[j]
+    design = np.dstack([np.ones((_N_TRIPLES, 3)), at[triples]])
+    size = np.abs(np.linalg.det(design))
+    # three stars in a row determine nothing
+    triples, design = triples[size > np.median(size)], design[size > np.median(size)]
+    linear = np.linalg.solve(design, to[triples])
+    left = np.column_stack([np.ones(len(i)), at]) @ linear - to
+    left = np.hypot(left[..., 0], left[..., 1])
+    quantile = np.quantile(left, _AGREEING_SHARE, axis=1)
+    best = left[np.argmin(quantile)]
+    keep = best <= 2.0 * quantile.min()
+    return i[keep], j[keep]
+
+
 def _neighbour_pairs(sources, reference, hypotheses):
     """First pairs: the stars of a group of hypotheses and neighbours that coincide."""
     tree = cKDTree(sources)
@@ -463,20 +560,14 @@ def _neighbour_pairs(sources, reference, hypotheses):
     return i, j
 
 
-def _correct_locally(sources, mapped, reference, pairs, scatter):
-    """Take off what neighbouring pairs have in common, if that helps pairs left out."""
-    i, j = pairs
-    if len(i) < 4 * _LOCAL_NEIGHBOURS:
-        return mapped, scatter
-    residual = reference[j] - mapped[i]
-    tree = cKDTree(sources[i])
-    _, near = tree.query(sources[i], k=_LOCAL_NEIGHBOURS + 1, workers=2)
-    left_out = residual - np.median(residual[near[:, 1:]], axis=1)
-    now = scatter_of(*left_out.T)
-    if now > 0.9 * scatter_of(*residual.T):
-        return mapped, scatter
-    _, near = tree.query(sources, k=_LOCAL_NEIGHBOURS, workers=2)
-    return mapped + np.median(residual[near], axis=1), now
+def _predict(sources, fit, local):
+    """Map positions; also the variance of that in units of the variance of one pair."""
+    mapped = np.column_stack(fit.mapping(*sources.T))
+    leverage = fit.leverage(*sources.T)
+    if local is None:
+        return mapped, leverage
+    correction, local_leverage = local(sources)
+    return mapped + correction, leverage + local_leverage
 
 
 def _crowding_limit(points, tree):
