@@ -1,0 +1,80 @@
+"""What a polynomial leaves: a moving local plane through the residuals of neighbouring pairs."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from wpdc_gwcs.matching._mapping import scatter_of
+
+__all__ = ["LocalCorrection"]
+
+N_NEIGHBOURS = 24
+# The correction must lower the scatter of pairs left out to less than this share, or it is noise.
+_WORTHWHILE = 0.97
+_BLOCK = 32768
+
+
+class LocalCorrection:
+    """Least-squares plane through the residuals of the nearest pairs, evaluated at a position.
+
+    Parameters
+    ----------
+    points : (N, 2) ndarray
+        Starting positions of pairs, px.
+    residual : (N, 2) ndarray
+        What to add to the mapped positions of these pairs, px.
+    """
+
+    def __init__(self, points, residual):
+        self.points = points
+        self.residual = residual
+        self.tree = cKDTree(points)
+
+    @classmethod
+    def if_worthwhile(cls, points, residual):
+        """Build the correction, or `None` if pairs left out do not profit from it.
+
+        Outliers need no care: pairs lie within a few standard deviations of the mapping.
+        """
+        if len(points) < 4 * N_NEIGHBOURS:
+            return None
+        before = scatter_of(*residual.T)
+        correction = cls(points, residual)
+        left_out = residual - correction(points, leave_out=True)[0]
+        return correction if scatter_of(*left_out.T) < _WORTHWHILE * before else None
+
+    def __call__(self, positions, *, leave_out=False):
+        """Evaluate the correction.
+
+        Parameters
+        ----------
+        positions : (M, 2) ndarray
+            Starting positions, px.
+        leave_out : bool
+            The positions are the pairs themselves: use the neighbours of each pair only.
+
+        Returns
+        -------
+        correction : (M, 2) ndarray
+            What to add to the mapped positions, px; zero where the neighbours lie on a line.
+        leverage : (M,) ndarray
+            Variance of the correction in units of the variance of one pair.
+        """
+        correction = np.zeros((len(positions), 2))
+        leverage = np.zeros(len(positions))
+        for start in range(0, len(positions), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            _, near = self.tree.query(positions[part], k=N_NEIGHBOURS + leave_out, workers=2)
+            near = near[:, 1:] if leave_out else near
+            step = self.points[near] - positions[part][:, None, :]
+            x, y = step[..., 0], step[..., 1]
+            sx, sy = x.sum(1), y.sum(1)
+            sxx, sxy, syy = (x * x).sum(1), (x * y).sum(1), (y * y).sum(1)
+            # first column of the inverse of the normal matrix of a + b x + c y
+            a, b, c = sxx * syy - sxy**2, sxy * sy - sx * syy, sx * sxy - sxx * sy
+            determinant = N_NEIGHBOURS * a + sx * b + sy * c
+            good = determinant > 1e-6 * N_NEIGHBOURS * sxx * syy
+            scale = np.where(good, 1 / np.where(good, determinant, 1), 0)
+            weight = (a[:, None] + b[:, None] * x + c[:, None] * y) * scale[:, None]
+            correction[part] = (weight[..., None] * self.residual[near]).sum(1)
+            leverage[part] = a * scale
+        return correction, leverage
