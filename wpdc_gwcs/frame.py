@@ -1,5 +1,6 @@
 """A frame: what one exposure of one detector brings to a calibration."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -8,7 +9,7 @@ __all__ = ["Frame"]
 
 @dataclass(frozen=True)
 class Frame:
-    """One exposure of one detector: an image or a source list, with the WCS and epoch of its header.
+    """One exposure of one detector: image or source list, with WCS and epoch of its header.
 
     Parameters
     ----------
@@ -19,8 +20,8 @@ class Frame:
     image_shape : (int, int)
         Shape of the detector, ``(ny, nx)`` in pixels.
     wcs : object
-        Starting WCS with the shared low-level interface (``pixel_to_world_values``, zero based), for example
-        `astropy.wcs.WCS`.
+        Starting WCS with the shared low-level interface (``pixel_to_world_values``, zero based),
+        for example `astropy.wcs.WCS`; world axes are ICRS, RA first.
     epoch : float, optional
         Mid-exposure epoch in Julian years; `None` where the header has no date.
     source : str
@@ -28,12 +29,26 @@ class Frame:
     load_image : callable, optional
         Returns the image as a float array ``[y, x]``; called once, when needed.
     load_sources : callable, optional
-        Returns the source table (``x``, ``y`` zero based, optional ``x_err``, ``y_err``, ``flux``, ``snr``,
-        ``roundness``, ``flags``).  Exactly one of the two loaders is given.
+        Returns the source table (``x``, ``y`` zero based, optional ``x_err``, ``y_err``, ``flux``,
+        ``snr``, ``roundness``, ``flags``).  Exactly one of the two loaders is given.
     gain, saturation : float, optional
         Electrons per count and saturation level in counts, from the header.
     meta : dict
         Other facts of the header worth keeping (filter, exposure time, ...).
+
+    Raises
+    ------
+    ValueError
+        If there is not exactly one loader, or the name, epoch or shape is impossible.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.wcs import WCS
+    >>> from wpdc_gwcs.frame import Frame
+    >>> frame = Frame("a", "NE", (20, 30), WCS(naxis=2), load_image=lambda: np.zeros((20, 30)))
+    >>> frame.load_image().shape
+    (20, 30)
     """
 
     name: str
@@ -51,3 +66,17 @@ class Frame:
     def __post_init__(self):
         if (self.load_image is None) == (self.load_sources is None):
             raise ValueError("a Frame needs exactly one of load_image and load_sources")
+        if not self.name or "/" in self.name:
+            raise ValueError(f"name must be fit for a file name, got {self.name!r}")
+        if self.epoch is not None and not math.isfinite(self.epoch):
+            raise ValueError(f"epoch must be a finite Julian year or None, got {self.epoch}")
+        try:
+            shape = tuple(int(n) for n in self.image_shape)
+            valid = len(shape) == 2 and min(shape) >= 1 and shape == tuple(self.image_shape)
+        except (TypeError, ValueError):
+            valid = False
+        if not valid:
+            raise ValueError(
+                f"image_shape must be (ny, nx), positive integers, got {self.image_shape!r}"
+            )
+        object.__setattr__(self, "image_shape", shape)

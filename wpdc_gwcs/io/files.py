@@ -192,10 +192,10 @@ def check_complete(path, *, error=FileFormatError):
         data is let pass: files without it are common and lack nothing.
     """
     path = Path(path)
-    with open(path, "rb") as file:
-        start = file.read(9)
-    kind = next((k for magic, k in _MAGIC if start.startswith(magic)), None)
     try:
+        with open(path, "rb") as file:
+            start = file.read(9)
+        kind = next((k for magic, k in _MAGIC if start.startswith(magic)), None)
         if kind in _OPENERS:
             with _OPENERS[kind](path, "rb") as file:
                 _walk(file, path, error, size=None)
@@ -208,6 +208,8 @@ def check_complete(path, *, error=FileFormatError):
     except InputError:
         raise
     except READ_ERRORS as problem:
+        if getattr(problem, "strerror", None):
+            raise error(f"{path}: must be a readable file: {problem.strerror}") from problem
         raise error(f"{path}: damaged FITS file: {first_line(problem)}") from problem
 
 

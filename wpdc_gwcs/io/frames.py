@@ -209,6 +209,9 @@ def _prepare(hdus, where, kind, index, given):
         header = _ldac_header(hdus, index, where)
     # Keywords of the whole file stand in the primary header.
     headers = [header.copy()] + ([hdus[0].header.copy()] if index > 0 else [])
+    if kind == "table" and given is not None:
+        # A bare table says nothing of the exposure.
+        headers.append(given)
     if kind != "image":
         names = hdu.columns.names
         if _position_columns(names) is None:
@@ -231,8 +234,8 @@ def _prepare(hdus, where, kind, index, given):
     elif hdu.is_image and hdu.ver > 1:
         label += f"_{hdu.ver}"
     shape = _image_shape(header) if kind == "image" else header_shape(header)
-    if shape is None and given is not None:
-        shape = header_shape(given)
+    if shape is None:
+        shape = header_shape(wcs_header)
     return {
         "kind": kind,
         "index": index,
@@ -563,8 +566,26 @@ def standardize_sources(table, *, name="sources"):
     flags = column("flags")
     if flags is not None:
         flags = np.nan_to_num(flags).astype(np.int64)
-        out["flags"] = flags if tag is None else flags & ~1
+        out["flags"] = flags if tag is None else _sextractor_flags(flags, column("imaflags_iso"))
     return Table({c: v for c, v in out.items() if v is not None})
+
+
+def _sextractor_flags(flags, external):
+    """Translate FLAGS and IMAFLAGS_ISO of SExtractor."""
+    from wpdc_gwcs.detection import FLAG_BAD_PIXEL, FLAG_BLENDED, FLAG_EDGE, FLAG_SATURATED
+
+    ours = np.zeros_like(flags)
+    # 2 deblended, 4 saturated, 8 truncated, 16 aperture incomplete, above: memory overflows
+    for theirs, flag in (
+        (2, FLAG_BLENDED),
+        (4, FLAG_SATURATED),
+        (8 | 16, FLAG_EDGE),
+        (32 | 64 | 128, FLAG_BAD_PIXEL),
+    ):
+        ours[flags & theirs != 0] |= flag
+    if external is not None:
+        ours[np.nan_to_num(external) != 0] |= FLAG_BAD_PIXEL
+    return ours
 
 
 def _ellipse(column, tag):
