@@ -2,10 +2,9 @@
 
 import numpy as np
 from astropy.modeling import Model, Parameter
-from scipy.interpolate import CubicSpline
 
 from wpdc_gwcs.models.blocks import evaluate_blocks
-from wpdc_gwcs.models.mapping import CellGrid, PlaneMap
+from wpdc_gwcs.models.mapping import CellGrid, PlaneMap, spline_cells
 
 __all__ = ["LookupTable"]
 
@@ -141,25 +140,13 @@ class LookupTable(Model):
             np.linspace(grid[0], grid[-1], len(grid)) for grid in (self._x_grid, self._y_grid)
         )
         if self._method == "cubic":
-            # A tensor product of one-dimensional splines; the power basis of scipy runs from the
-            # highest power down, in units of the grid, and puts (power, cell) first.
-            along_y = CubicSpline(y_grid, displacement, axis=1).c  # q, j, k, x
-            both = CubicSpline(x_grid, along_y, axis=3).c  # p, i, q, j, k
-            coefficients = np.moveaxis(both[::-1, :, ::-1], (4, 0, 2, 3, 1), (0, 1, 2, 3, 4))
+            cells = spline_cells(x_grid, y_grid, displacement)
         else:
             low, high = displacement[:, :-1], displacement[:, 1:]
             along_y = np.stack([low, high - low])  # q, k, j, x
             low, high = along_y[..., :-1], along_y[..., 1:]
             both = np.stack([low, high - low])  # p, q, k, j, i
-            coefficients = np.moveaxis(both, 2, 0)
-        if self._method == "cubic":
-            # From pixels to the local coordinate of a cell, 0 to 1.
-            x_scale = (x_grid[1] - x_grid[0]) ** np.arange(4)
-            y_scale = (y_grid[1] - y_grid[0]) ** np.arange(4)
-            coefficients = (
-                coefficients * (x_scale[:, np.newaxis] * y_scale)[..., np.newaxis, np.newaxis]
-            )
-        cells = CellGrid(x_grid[[0, -1]], y_grid[[0, -1]], coefficients)
+            cells = CellGrid(x_grid[[0, -1]], y_grid[[0, -1]], np.moveaxis(both, 2, 0))
         self._cache = (displacement.copy(), cells)
         return cells
 

@@ -15,17 +15,22 @@ import threading
 from math import comb
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from wpdc_gwcs.models.terms import pv_terms
 
-__all__ = ["CellGrid", "PlaneMap", "expand_pv", "fit_polynomial"]
+__all__ = ["CellGrid", "PlaneMap", "expand_pv", "fit_polynomial", "spline_cells"]
 
 _MAX_NEWTON = 25
 
 # The fit that starts the inversion: degree, and points along each axis.  It leaves a few px of a
-# distortion of 200 px, so that Newton's method needs two steps instead of three.
-_START_DEGREE = 4
-_START_NODES = 17
+# distortion of 200 px.
+_FIT_DEGREE = 4
+_FIT_NODES = 17
+
+# The spline that starts it for many points: nodes along each axis, and how many are many.
+_SPLINE_NODES = 65
+_SPLINE_SIZE = 4096
 
 # How far outside the grid (px) an iterate may go.
 _RIM = 1e-6
@@ -203,6 +208,13 @@ class CellGrid:
         # fetching is what the look-up costs.
         self.rows = np.ascontiguousarray(coefficients.reshape(2, n, n, -1).transpose(0, 2, 3, 1))
 
+    def clip(self, x, y, margin=0.0):
+        """Move points outside the grid onto its rim, or onto a margin around it, in place."""
+        np.maximum(x, self.x_low - margin, out=x)
+        np.minimum(x, self.x_high + margin, out=x)
+        np.maximum(y, self.y_low - margin, out=y)
+        np.minimum(y, self.y_high + margin, out=y)
+
     @property
     def coefficients(self):
         """The coefficients the grid was made of, ``[k, p, q, j, i]``."""
@@ -320,6 +332,34 @@ class CellGrid:
         return CellGrid((self.x_low, self.x_high), (self.y_low, self.y_high), total)
 
 
+def spline_cells(x_grid, y_grid, values):
+    """Return the cells of the bicubic spline through values on a grid (not-a-knot ends).
+
+    Parameters
+    ----------
+    x_grid, y_grid : (nx,), (ny,) ndarray
+        Positions of the nodes, equally spaced, four or more.
+    values : (2, ny, nx) ndarray
+        Values at the nodes.
+
+    Returns
+    -------
+    cells : CellGrid
+        The spline.
+    """
+    # A tensor product of one-dimensional splines; the power basis of scipy runs from the highest
+    # power down, in units of the grid, and puts (power, cell) first.
+    along_y = CubicSpline(y_grid, values, axis=1).c  # q, j, k, x
+    both = CubicSpline(x_grid, along_y, axis=3).c  # p, i, q, j, k
+    coefficients = np.moveaxis(both[::-1, :, ::-1], (4, 0, 2, 3, 1), (0, 1, 2, 3, 4))
+    # From units of the grid to the local coordinate of a cell, 0 to 1.
+    x_scale = (x_grid[1] - x_grid[0]) ** np.arange(4)
+    y_scale = (y_grid[1] - y_grid[0]) ** np.arange(4)
+    scale = x_scale[:, np.newaxis] * y_scale
+    coefficients = coefficients * scale[..., np.newaxis, np.newaxis]
+    return CellGrid(x_grid[[0, -1]], y_grid[[0, -1]], coefficients)
+
+
 class PlaneMap:
     """A smooth map of the plane: polynomial, radial terms and cells, summed.
 
@@ -349,7 +389,7 @@ class PlaneMap:
         self.radial = radial
         self.radial_matrix = np.eye(2) if radial_matrix is None else radial_matrix
         self.grid = grid
-        self._start_fit = None
+        self._start_fit = self._start_range = self._start_spline = None
         if polynomial is not None:
             self.derivatives = [(_derivative(c, 0), _derivative(c, 1)) for c in polynomial]
 
@@ -359,13 +399,15 @@ class PlaneMap:
         b = m[1, 0] * u + m[1, 1] * v
         return a, b, np.sqrt(a * a + b * b)
 
-    def __call__(self, x, y):
+    def __call__(self, x, y, margin=0.0):
         """Map a block of points.
 
         Parameters
         ----------
         x, y : (N,) ndarray
             Points.
+        margin : float, optional
+            How far outside the grid its outermost cells are still used.
 
         Returns
         -------
@@ -381,7 +423,7 @@ class PlaneMap:
                 a += np.polynomial.polynomial.polyval(r, self.radial[0])
                 b += np.polynomial.polynomial.polyval(r, self.radial[1])
         if self.grid is not None:
-            cell, s, t, outside = self.grid.locate(x, y)
+            cell, s, t, outside = self.grid.locate(x, y, margin)
             ga, gb = self.grid.evaluate(cell, s, t)
             ga += a
             gb += b
@@ -438,7 +480,7 @@ class PlaneMap:
                     value[outside] = np.nan
         return values, derivatives
 
-    def invert(self, a, b, *, tolerance, margin=_RIM):
+    def invert(self, a, b, *, tolerance, margin=_RIM, start=None):
         """Invert a block of points by Newton's method with the analytic Jacobian.
 
         Parameters
@@ -450,6 +492,8 @@ class PlaneMap:
         margin : float, optional
             How far outside the grid an answer may lie.  Answers within the default margin, which is
             there for rounding only, are put on the rim.
+        start : (x, y), optional
+            Where to start; chosen by default.
 
         Returns
         -------
@@ -464,73 +508,120 @@ class PlaneMap:
         point where the Jacobian determinant is not positive (the image is folded over there) is no
         answer either.
         """
-        x_out, y_out = np.full(a.shape, np.nan), np.full(a.shape, np.nan)
-        index = np.flatnonzero(np.isfinite(a) & np.isfinite(b))
-        whole = len(index) == len(a)
-        a, b = (value if whole else value[index] for value in (a, b))
-        x, y = self._start(a, b)
-        self._clip(x, y)
-        # Rounding of the map itself sets the floor.
-        limit = tolerance + 16 * np.finfo(float).eps * np.maximum(np.abs(a), np.abs(b))
+        good = np.isfinite(a)
+        good &= np.isfinite(b)
         with np.errstate(all="ignore"):
-            for _ in range(_MAX_NEWTON):
-                if not len(index):
-                    break
-                (fa, fb), (a_x, a_y, b_x, b_y) = self.jacobian(x, y, margin)
-                np.subtract(a, fa, out=fa)
-                np.subtract(b, fb, out=fb)
-                determinant = a_x * b_y
-                determinant -= a_y * b_x
-                done = np.abs(fa) <= limit
-                done &= np.abs(fb) <= limit
-                n_done = np.count_nonzero(done)
-                if n_done:
-                    answer = done & (determinant > 0)
-                    x_out[index[answer]] = x[answer]
-                    y_out[index[answer]] = y[answer]
-                if n_done == len(index):
-                    break
-                b_y *= fa
-                a_y *= fb
-                b_y -= a_y
-                b_y /= determinant
-                a_x *= fb
-                b_x *= fa
-                a_x -= b_x
-                a_x /= determinant
-                x_new, y_new = x + b_y, y + a_x
-                self._clip(x_new, y_new, margin)
-                # A point that no longer moves, or left for infinity, has no answer.
-                going = (x_new != x) | (y_new != y)
-                going &= np.isfinite(x_new) & np.isfinite(y_new)
-                going &= ~done
-                if going.all():
-                    x, y = x_new, y_new
-                else:
-                    a, b, limit, index = (value[going] for value in (a, b, limit, index))
-                    x, y = x_new[going], y_new[going]
-        if margin <= _RIM:
-            self._clip(x_out, y_out)
+            if good.all():
+                x, y = self._solve(a, b, start, tolerance, margin)
+            else:
+                x, y = np.full(a.shape, np.nan), np.full(a.shape, np.nan)
+                start = None if start is None else [value[good] for value in start]
+                x[good], y[good] = self._solve(a[good], b[good], start, tolerance, margin)
+            if margin <= _RIM:
+                self._clip(x, y, 0.0)
+        return x, y
+
+    def _solve(self, a, b, start, tolerance, margin):
+        if not len(a):
+            return np.empty(0), np.empty(0)
+        x, y = self._start(a, b) if start is None else (value.copy() for value in start)
+        self._clip(x, y, margin)
+        x, y, determinant = self._newton_step(a, b, x, y, margin)
+        residual = self._residual(a, b, x, y, margin)
+        if residual.max() <= tolerance and determinant.min() > 0:
+            return x, y
+        # The points that are not done go on by themselves.  Rounding of the map sets the floor.
+        limit = tolerance + 16 * np.finfo(float).eps * np.maximum(np.abs(a), np.abs(b))
+        x_out, y_out = np.full(a.shape, np.nan), np.full(a.shape, np.nan)
+        index = np.arange(len(a))
+        x_new, y_new = x, y
+        x = y = np.full(a.shape, np.nan)
+        for _ in range(_MAX_NEWTON):
+            done = residual <= limit
+            answer = done & (determinant > 0)
+            x_out[index[answer]] = x_new[answer]
+            y_out[index[answer]] = y_new[answer]
+            # A point that no longer moves, or left for infinity, has no answer.
+            going = (x_new != x) | (y_new != y)
+            going &= np.isfinite(x_new) & np.isfinite(y_new)
+            going &= ~done
+            if not going.any():
+                break
+            a, b, limit, index = a[going], b[going], limit[going], index[going]
+            x, y = x_new[going], y_new[going]
+            x_new, y_new, determinant = self._newton_step(a, b, x, y, margin)
+            residual = self._residual(a, b, x_new, y_new, margin)
         return x_out, y_out
 
+    def _residual(self, a, b, x, y, margin):
+        """Return the greater of both residuals; it needs no derivatives."""
+        fa, fb = self(x, y, margin)
+        np.subtract(a, fa, out=fa)
+        np.subtract(b, fb, out=fb)
+        np.abs(fa, out=fa)
+        np.abs(fb, out=fb)
+        return np.maximum(fa, fb, out=fa)
+
+    def _newton_step(self, a, b, x, y, margin):
+        """Return the next iterate and the Jacobian determinant at the present one."""
+        (fa, fb), (a_x, a_y, b_x, b_y) = self.jacobian(x, y, margin)
+        np.subtract(a, fa, out=fa)
+        np.subtract(b, fb, out=fb)
+        determinant = a_x * b_y
+        determinant -= a_y * b_x
+        b_y *= fa
+        a_y *= fb
+        b_y -= a_y
+        b_y /= determinant
+        b_y += x
+        a_x *= fb
+        b_x *= fa
+        a_x -= b_x
+        a_x /= determinant
+        a_x += y
+        self._clip(b_y, a_x, margin)
+        return b_y, a_x, determinant
+
     def _start(self, a, b):
-        """Return where to start the inversion: a fit of the inverse, or the images themselves."""
+        """Return where to start the inversion.
+
+        The images themselves where there is no telling where a fit should hold; else a polynomial
+        fit of the inverse, or for many points a spline of the inverse, which leaves one step to do.
+        """
         if self.grid is None:
-            # No telling where a fit should hold; distortion is small beside the identity.
             return a.copy(), b.copy()
         if self._start_fit is None:
             grid = self.grid
             x, y = np.meshgrid(
-                np.linspace(grid.x_low, grid.x_high, _START_NODES),
-                np.linspace(grid.y_low, grid.y_high, _START_NODES),
+                np.linspace(grid.x_low, grid.x_high, _FIT_NODES),
+                np.linspace(grid.y_low, grid.y_high, _FIT_NODES),
             )
             x, y = x.ravel(), y.ravel()
-            self._start_fit = fit_polynomial(self(x, y), (x, y), _START_DEGREE)
-        polynomial, origin = self._start_fit
-        u, v = a - origin[0], b - origin[1]
-        return [_horner(c, u, v) for c in polynomial]
+            images = self(x, y)
+            self._start_fit = PlaneMap(*fit_polynomial(images, (x, y), _FIT_DEGREE))
+            self._start_range = [(image.min(), image.max()) for image in images]
+        if len(a) < _SPLINE_SIZE:
+            return self._start_fit(a, b)
+        if self._start_spline is None:
+            self._start_spline = self._make_start_spline()
+        spline = self._start_spline
+        # Held at the edge: what lies farther out has no answer anyway.
+        a, b = a.copy(), b.copy()
+        spline.clip(a, b)
+        cell, s, t, _ = spline.locate(a, b)
+        return spline.evaluate(cell, s, t)
 
-    def _clip(self, x, y, margin=0.0):
+    def _make_start_spline(self):
+        """Return a spline of the inverse over the rectangle that the grid is mapped into."""
+        a_grid, b_grid = (np.linspace(low, high, _SPLINE_NODES) for low, high in self._start_range)
+        a, b = (value.ravel() for value in np.meshgrid(a_grid, b_grid))
+        start = self._start_fit(a, b)
+        # The rectangle reaches beyond the grid; its outermost cells are good enough for a start.
+        margin = 2 * max(self.grid.x_step, self.grid.y_step)
+        solved = self.invert(a, b, tolerance=1e-6, margin=margin, start=start)
+        values = np.where(np.isfinite(solved), solved, start)
+        return spline_cells(a_grid, b_grid, values.reshape(2, _SPLINE_NODES, _SPLINE_NODES))
+
+    def _clip(self, x, y, margin):
         if self.grid is not None:
-            np.clip(x, self.grid.x_low - margin, self.grid.x_high + margin, out=x)
-            np.clip(y, self.grid.y_low - margin, self.grid.y_high + margin, out=y)
+            self.grid.clip(x, y, margin)

@@ -17,26 +17,38 @@ class _Tangent:
 
     def project(self, ra, dec):
         """Sky in degrees to the plane in degrees, NaN on the far hemisphere."""
-        angle = ra - self.ra0
-        angle *= np.pi / 180
-        dec = dec * (np.pi / 180)
-        cos_dec = np.cos(dec)
-        sin_dec = np.sin(dec)
-        xi = np.sin(angle)
+        # Sines and cosines from the tangents of the half angles, which numpy has in vector
+        # instructions; numerators and denominator share the factor (1 + tan_ra^2) (1 + tan_dec^2).
+        tan_ra = ra - self.ra0
+        tan_ra *= np.pi / 360
+        np.tan(tan_ra, out=tan_ra)
+        tan_dec = dec * (np.pi / 360)
+        np.tan(tan_dec, out=tan_dec)
+        square = tan_ra * tan_ra
+        cos_dec = tan_dec * tan_dec
+        np.subtract(1.0, cos_dec, out=cos_dec)
+        xi = 2.0 * tan_ra
         xi *= cos_dec
-        toward = np.cos(angle, out=angle)
-        toward *= cos_dec
-        depth = self.sin0 * sin_dec
-        depth += self.cos0 * toward
-        sin_dec *= self.cos0
-        toward *= self.sin0
-        sin_dec -= toward
+        ahead = 1.0 - square
+        ahead *= cos_dec
+        square += 1.0
+        eta = tan_dec
+        eta *= 2.0
+        eta *= square
+        depth = self.sin0 * eta
+        depth += self.cos0 * ahead
+        eta *= self.cos0
+        ahead *= self.sin0
+        eta -= ahead
         # The horizon itself is infinitely far away.
-        depth[~(depth > 1e-12)] = np.nan
+        square *= 1e-12
+        hidden = ~(depth > square)
+        if hidden.any():
+            depth[hidden] = np.nan
         np.divide(180 / np.pi, depth, out=depth)
         xi *= depth
-        sin_dec *= depth
-        return xi, sin_dec
+        eta *= depth
+        return xi, eta
 
     def deproject(self, xi, eta):
         """Plane in degrees to the sky in degrees; right ascension from 0 to 360."""
