@@ -202,8 +202,10 @@ def _prepare(name_x, name_y, x, y, brightness, name_brightness):
         )
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     points = np.column_stack([x[rows], y[rows]])
-    _, first = np.unique(points, axis=0, return_index=True)
-    first.sort()
+    order = np.lexsort(points.T)
+    again = np.zeros(len(rows), bool)
+    again[order[1:]] = (np.diff(points[order], axis=0) == 0).all(axis=1)
+    first = np.flatnonzero(~again)
     n_duplicates = len(rows) - len(first)
     points, rows = points[first], rows[first]
     if brightness is not None:

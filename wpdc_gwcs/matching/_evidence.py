@@ -11,8 +11,8 @@ from wpdc_gwcs.matching._pairs import find_edges, one_to_one
 __all__ = ["AreaEvidence", "Evidence", "collect_evidence", "poisson_significance"]
 
 # Sources looked at for the chance level, and shifts tried.
-_SAMPLE = 20_000
-_N_SHIFTS = 12
+_SAMPLE = 10_000
+_N_SHIFTS = 10
 # Pairs that an area must lead one to expect before it is judged, and pairs that make it worth
 # splitting.
 _JUDGED = 8.0
@@ -107,7 +107,7 @@ def poisson_significance(count, expected):
     return float(np.sqrt(max(0.0, -2 * log_p)))
 
 
-def collect_evidence(detector, mapped, radius, reference, tree, limit, mapping, pairs, image_shape):
+def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shape):
     """Measure what a set of pairs is worth.
 
     Parameters
@@ -116,12 +116,8 @@ def collect_evidence(detector, mapped, radius, reference, tree, limit, mapping, 
         Starting and mapped positions of the sources, px.
     radius : (N,) ndarray
         Pairing radius of each source, px.
-    reference : (M, 2) ndarray
-        Reference positions, px.
-    tree : `~scipy.spatial.cKDTree`
-        Tree of `reference`.
-    limit : (M,) ndarray
-        Largest radius usable at each reference star.
+    stars : Stars
+        The reference stars.
     mapping : SmoothMap
         The mapping, which also costs degrees of freedom.
     pairs : (i_src, i_ref)
@@ -148,10 +144,10 @@ def collect_evidence(detector, mapped, radius, reference, tree, limit, mapping, 
     usable = np.flatnonzero(radius > 0)
     step = max(1, -(-len(usable) // _SAMPLE))
     sample = usable[::step]
-    by_chance, hits = _count_by_chance(mapped[sample], radius[sample], tree, limit)
+    by_chance, hits = _count_by_chance(mapped[sample], radius[sample], stars)
     by_chance *= len(usable) / max(1, len(sample))
     hit_weight = len(usable) / max(1, len(sample)) / _N_SHIFTS
-    back_x, back_y = mapping.inverse(reference[:, 0], reference[:, 1])
+    back_x, back_y = mapping.inverse(*stars.points.T)
     inside = (back_x > -0.5) & (back_x < nx - 0.5) & (back_y > -0.5) & (back_y < ny - 0.5)
     n_reference = int(np.count_nonzero(inside))
     n_sources = len(detector)
@@ -183,7 +179,7 @@ def collect_evidence(detector, mapped, radius, reference, tree, limit, mapping, 
     )
 
 
-def _count_by_chance(mapped, radius, tree, limit):
+def _count_by_chance(mapped, radius, stars):
     """Mean number of pairs at shifted positions, and the sources in them, all shifts."""
     if len(mapped) == 0:
         return 0.0, np.empty(0, int)
@@ -193,8 +189,8 @@ def _count_by_chance(mapped, radius, tree, limit):
         # golden-angle spiral: directions and lengths without a common period
         length = base * (1 + 2 * (k + 0.5) / _N_SHIFTS)
         shift = length * np.array([np.cos(2.39996 * k), np.sin(2.39996 * k)])
-        i, j, _ = find_edges(mapped + shift, tree, radius, limit=limit)
-        keep, _ = one_to_one(i, j, len(mapped), tree.n)
+        i, j, _ = find_edges(mapped + shift, stars.tree, radius, limit=stars.limit)
+        keep, _ = one_to_one(i, j, len(mapped), len(stars.points))
         hits.append(i[keep])
     hits = np.concatenate(hits)
     return len(hits) / _N_SHIFTS, hits

@@ -10,8 +10,9 @@ neighbours coincide; how many coincide by chance follows from how many differenc
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import gammainc
+
+from wpdc_gwcs.matching._pairs import find_nearest
 
 __all__ = [
     "Hypotheses",
@@ -61,15 +62,13 @@ def density_ratio_map(xs, ys, xr, yr, image_shape, *, per_cell=40.0):
     return (counts[0] + 1) / (counts[1] + 1), x_edges, y_edges
 
 
-def neighbour_pattern(points, tree, rows, n_neighbours, *, workers=2):
+def neighbour_pattern(tree, rows, n_neighbours):
     """Neighbours of some stars in polar form.
 
     Parameters
     ----------
-    points : (N, 2) ndarray
-        Positions of all stars of the list, px.
     tree : `~scipy.spatial.cKDTree`
-        Tree of `points`.
+        Tree of all stars of the list.
     rows : (n,) ndarray of int
         Stars whose neighbours are wanted.
     n_neighbours : int
@@ -83,8 +82,9 @@ def neighbour_pattern(points, tree, rows, n_neighbours, *, workers=2):
     neighbour : (n, k) ndarray of int
         Row of each neighbour.
     """
+    points = tree.data
     k = min(n_neighbours, tree.n - 1)
-    distance, neighbour = tree.query(points[rows], k=k + 1, workers=workers)
+    distance, neighbour = find_nearest(tree, points[rows], k + 1)
     distance, neighbour = distance[:, 1:], neighbour[:, 1:]
     step = points[neighbour] - points[rows][:, None, :]
     with np.errstate(divide="ignore"):
@@ -143,8 +143,8 @@ def compare_patterns(
 
     Parameters
     ----------
-    sources : (N, 2) ndarray
-        Positions of the sources, px.
+    sources : `~scipy.spatial.cKDTree`
+        Tree of the sources.
     anchors : (n,) ndarray of int
         Sources to find.
     tree : `~scipy.spatial.cKDTree`
@@ -163,16 +163,14 @@ def compare_patterns(
     Hypotheses
         The best candidates, most surprising first.
     """
-    reference = tree.data
-    source_tree = cKDTree(sources)
-    source_log, source_angle, _ = neighbour_pattern(sources, source_tree, anchors, n_source)
-    candidates = tree.query_ball_point(sources[anchors], reach, workers=2, return_sorted=False)
+    source_log, source_angle, _ = neighbour_pattern(sources, anchors, n_source)
+    candidates = tree.query_ball_point(sources.data[anchors], reach, return_sorted=False)
     sizes = np.array([len(c) for c in candidates])
     if sizes.sum() == 0:
         return Hypotheses(*(np.empty(0, int),) * 2, *(np.empty(0),) * 6)
     wanted = np.concatenate([np.asarray(c, int) for c in candidates])
     rows, where = np.unique(wanted, return_inverse=True)
-    reference_log, reference_angle, _ = neighbour_pattern(reference, tree, rows, n_reference)
+    reference_log, reference_angle, _ = neighbour_pattern(tree, rows, n_reference)
     anchor_of = np.repeat(np.arange(len(anchors)), sizes)
     per_pair = source_log.shape[1] * reference_log.shape[1]
     parts = []

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from wpdc_gwcs.matching._mapping import scatter_of
+from wpdc_gwcs.matching._pairs import find_nearest
 
 __all__ = ["LocalCorrection"]
 
@@ -63,7 +64,7 @@ class LocalCorrection:
         leverage = np.zeros(len(positions))
         for start in range(0, len(positions), _BLOCK):
             part = slice(start, start + _BLOCK)
-            _, near = self.tree.query(positions[part], k=N_NEIGHBOURS + leave_out, workers=2)
+            _, near = find_nearest(self.tree, positions[part], N_NEIGHBOURS + leave_out)
             near = near[:, 1:] if leave_out else near
             step = self.points[near] - positions[part][:, None, :]
             x, y = step[..., 0], step[..., 1]

@@ -3,10 +3,18 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-__all__ = ["find_edges", "one_to_one", "pair_nearest"]
+__all__ = ["find_edges", "find_nearest", "one_to_one", "pair_nearest"]
+
+# Points from which on a second thread is worth its start.
+_THREADED = 20_000
 
 
-def find_edges(points, tree, radius, *, limit=None, workers=2):
+def find_nearest(tree, points, k, **options):
+    """Query a tree with as many threads as pay."""
+    return tree.query(points, k=k, workers=2 if len(points) > _THREADED else 1, **options)
+
+
+def find_edges(points, tree, radius, *, limit=None):
     """List who has whom within reach.
 
     Parameters
@@ -21,8 +29,6 @@ def find_edges(points, tree, radius, *, limit=None, workers=2):
         Largest radius that may be used to reach each partner (where partners stand close, a wide
         radius says
         nothing).
-    workers : int
-        Threads for the tree.
 
     Returns
     -------
@@ -38,11 +44,8 @@ def find_edges(points, tree, radius, *, limit=None, workers=2):
         empty = np.empty(0, int)
         return empty, empty.copy(), np.empty(0)
     reach = radius[active]
-    distance, partner = tree.query(
-        points[active],
-        k=min(3, tree.n),
-        distance_upper_bound=reach.max() * (1 + 1e-12),
-        workers=workers,
+    distance, partner = find_nearest(
+        tree, points[active], min(3, tree.n), distance_upper_bound=reach.max() * (1 + 1e-12)
     )
     distance = distance.reshape(len(active), -1)
     partner = partner.reshape(len(active), -1)
@@ -71,7 +74,7 @@ def one_to_one(i, j, n_points, n_partners):
     return keep, int(np.count_nonzero(degree_i) - np.count_nonzero(keep))
 
 
-def pair_nearest(xs, ys, xr, yr, radius, *, workers=2):
+def pair_nearest(xs, ys, xr, yr, radius):
     """Pair two lists of positions one to one within a radius, leaving out what is ambiguous.
 
     A pair is delivered when the source has exactly one reference star within its radius and no
@@ -88,8 +91,6 @@ def pair_nearest(xs, ys, xr, yr, radius, *, workers=2):
         Positions of the reference stars in the same system, px.
     radius : float or (N,) array_like
         Largest distance of a pair, px; one number or one per source.
-    workers : int
-        Threads for the nearest-neighbour search.
 
     Returns
     -------
@@ -121,7 +122,7 @@ def pair_nearest(xs, ys, xr, yr, radius, *, workers=2):
     good_j = np.flatnonzero(np.isfinite(partners).all(axis=1))
     reach = np.broadcast_to(radius, (len(points),))[good_i]
     tree = cKDTree(partners[good_j])
-    i, j, _ = find_edges(points[good_i], tree, reach, workers=workers)
+    i, j, _ = find_edges(points[good_i], tree, reach)
     keep, n_ambiguous = one_to_one(i, j, len(good_i), len(good_j))
     return good_i[i[keep]], good_j[j[keep]], n_ambiguous
 

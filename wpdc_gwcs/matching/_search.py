@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,7 +19,7 @@ from wpdc_gwcs.matching._features import (
 )
 from wpdc_gwcs.matching._local import LocalCorrection
 from wpdc_gwcs.matching._mapping import fit_smooth_map, scatter_of
-from wpdc_gwcs.matching._pairs import find_edges, one_to_one
+from wpdc_gwcs.matching._pairs import find_edges, find_nearest, one_to_one
 
 __all__ = ["Limits", "Search", "Stars"]
 
@@ -34,8 +35,8 @@ _LEVELS = (500, 2000)
 _REFERENCE_SURPLUS = 2.0
 # Sources per star of the sparser list in a subset.
 _SOURCE_SURPLUS = 1.3
-# Stars to look up by their neighbourhood and neighbours to compare, first and second try.
-_TRIES = ((48, 12), (200, 24))
+# Stars to look up by their neighbourhood and neighbours to compare, try by try.
+_TRIES = ((16, 12), (49, 12), (196, 24))
 # Groups of hypotheses that are followed up.
 _N_SEEDS = 8
 # Triples of pairs tried for a linear mapping, and the share of pairs that should follow it.
@@ -48,6 +49,8 @@ _FIT_SAMPLE = 20_000
 _GROW_RADIUS = 5.0
 _FINAL_RADIUS = 5.5
 _SMALLEST_RADIUS = 0.05
+# Radius about a mapping that the caller gives.
+_START_RADIUS = 20.0
 # A radius must not reach further than where this many stars are expected by chance.
 _MAX_CROWDING = 0.25
 # Radius that may be used where stars are so sparse that 0.3 % are expected by chance within it.
@@ -135,14 +138,19 @@ class Search:
 
     # starts
 
+    @cached_property
+    def limit(self):
+        """Largest radius that says something at each source."""
+        return _crowding_limit(self.sources, cKDTree(self.sources))
+
     def from_start(self, start, clock):
         """Begin with a mapping that is known to be nearly right."""
-        mapped = np.column_stack(start(*self.sources.T))
-        radius = np.minimum(_crowding_limit(self.sources, cKDTree(self.sources)), 20.0)
-        i, j, _ = find_edges(mapped, self.stars.tree, radius, limit=self.stars.limit)
-        keep, _ = one_to_one(i, j, len(self.sources), len(self.stars.points))
+        part = _sample(len(self.sources))
+        mapped = np.column_stack(start(*self.sources[part].T))
+        radius = np.minimum(self.limit[part], _START_RADIUS)
+        pairs, _ = _pair(mapped, radius, self.limit[part], self.stars)
         clock.lap("start")
-        found = self.finish(self.sources, (i[keep], j[keep]), clock)
+        found = self.finish(self.sources, (part[pairs[0]], pairs[1]), clock)
         if found is None:
             raise self.refusal(hint=False)
         return *found, 1
@@ -154,45 +162,44 @@ class Search:
             reference = self.stars
             if len(rows_r) < len(reference.points):
                 reference = Stars.build(reference.points[rows_r])
-            subset = self.sources[rows_s]
             for n_anchors, n_neighbours in _TRIES:
                 seeds = []
                 for turn in turns:
-                    turned = (subset - self.frame.center) @ turn.T + self.frame.center
+                    sources = Stars.build(self.turned(turn)[rows_s])
                     hypotheses, groups = self.seeds(
-                        turned, reference, self.flux_rank(rows_s), n_anchors, n_neighbours
+                        sources, reference, self.flux_rank(rows_s), n_anchors, n_neighbours
                     )
                     seeds += [
-                        (support, turn, turned, hypotheses.take(rows)) for support, rows in groups
+                        (support, turn, sources, hypotheses.take(rows)) for support, rows in groups
                     ]
                 clock.lap("patterns")
                 seeds.sort(key=lambda seed: -seed[0])
-                for _, turn, turned, hypotheses in seeds[:_N_SEEDS]:
-                    found = self.try_group(
-                        turn, turned, rows_s, reference, rows_r, hypotheses, clock
-                    )
-                    if found is not None:
-                        self.check_header(found[0])
-                        parity = int(np.sign(np.linalg.det(turn)))
-                        return _turn_mapping(found[0], turn), *found[1:], parity
+                for _, turn, sources, hypotheses in seeds[:_N_SEEDS]:
+                    for pairs in _first_pairs(sources, reference, hypotheses):
+                        found = self.try_pairs(
+                            turn, sources, rows_s, reference, rows_r, pairs, clock
+                        )
+                        if found is not None:
+                            self.check_header(found[0])
+                            parity = int(np.sign(np.linalg.det(turn)))
+                            return _turn_mapping(found[0], turn), *found[1:], parity
         raise self.refusal(hint=not blind)
 
-    def try_group(self, turn, turned, rows_s, reference, rows_r, hypotheses, clock):
-        """Grow from a group of hypotheses: from all its pairs, from those that agree best, ..."""
-        for pairs in _first_pairs(turned, reference, hypotheses):
-            pairs = self.grow_from(turned, reference, pairs, clock)
-            if pairs is None:
-                continue
-            pairs = rows_s[pairs[0]], rows_r[pairs[1]]
-            key = hash((turn.tobytes(), pairs[0].tobytes(), pairs[1].tobytes()))
-            if key in self.seen:
-                continue
-            self.seen.add(key)
-            everything = (self.sources - self.frame.center) @ turn.T + self.frame.center
-            found = self.finish(everything, pairs, clock)
-            if found is not None:
-                return found
-        return None
+    def try_pairs(self, turn, sources, rows_s, reference, rows_r, pairs, clock):
+        """Grow from first pairs of a subset to the frame; None without evidence."""
+        pairs = self.grow_from(sources, reference, pairs, clock)
+        if pairs is None:
+            return None
+        pairs = rows_s[pairs[0]], rows_r[pairs[1]]
+        key = turn.tobytes(), _key(pairs)
+        if key in self.seen:
+            return None
+        self.seen.add(key)
+        return self.finish(self.turned(turn), pairs, clock)
+
+    def turned(self, turn):
+        """All sources, turned about the centre of the frame."""
+        return (self.sources - self.frame.center) @ turn.T + self.frame.center
 
     def subsets(self):
         """Rows of sources and reference stars to try in turn, bright ones first.
@@ -226,15 +233,15 @@ class Search:
 
     def seeds(self, sources, reference, rank, n_anchors, n_neighbours):
         """Hypotheses for a spread of anchors and the groups among them that agree."""
-        ratio, _, _ = density_ratio_map(*sources.T, *reference.points.T, self.shape)
+        ratio, _, _ = density_ratio_map(*sources.points.T, *reference.points.T, self.shape)
         many, few = np.quantile(ratio, [0.75, 0.25])
         n_source = int(min(MAX_NEIGHBOURS, np.ceil(n_neighbours * max(1.0, many))))
         n_reference = int(min(MAX_NEIGHBOURS, np.ceil(n_neighbours * max(1.0, 1 / few))))
-        anchors = self.anchors(sources, rank, n_anchors)
-        distance = np.hypot(*(sources[anchors] - self.frame.center).T)
+        anchors = self.anchors(sources.points, rank, n_anchors)
+        distance = np.hypot(*(sources.points[anchors] - self.frame.center).T)
         limits = self.limits
         hypotheses = compare_patterns(
-            sources,
+            sources.tree,
             anchors,
             reference.tree,
             reach=limits.reach(distance),
@@ -246,7 +253,7 @@ class Search:
         area = np.pi * (limits.half_diagonal + limits.reach(limits.half_diagonal)) ** 2
         groups = select_coherent(
             hypotheses,
-            sources,
+            sources.points,
             reference.points,
             curvature=limits.curvature,
             density=len(reference.points) / area,
@@ -277,129 +284,103 @@ class Search:
 
     def grow_from(self, sources, reference, pairs, clock):
         """Pairs of a subset that follow from first pairs, or None without evidence."""
-        grown = self.grow(sources, reference, pairs)
+        part = _sample(len(sources.points), pairs[0])
+        pairs = np.searchsorted(part, pairs[0]), pairs[1]
+        points = sources.points[part]
+        grown = self.grow(points, sources.limit[part], reference, pairs)
         clock.lap("grow")
         if grown is None:
             return None
         fit, pairs, mapped, radius = grown
         evidence = collect_evidence(
-            sources,
-            mapped,
-            radius,
-            reference.points,
-            reference.tree,
-            reference.limit,
-            fit.mapping,
-            pairs,
-            self.shape,
+            points, mapped, radius, reference, fit.mapping, pairs, self.shape
         )
         clock.lap("evidence")
         # loose: this only spares hopeless starts the full round
         if evidence.significance < 4 or evidence.purity < 0.5:
             self.note_failure(evidence)
             return None
-        return pairs
+        return part[pairs[0]], pairs[1]
 
-    def grow(self, sources, reference, pairs, *, rounds=40):
+    def grow(self, points, limit, reference, pairs, *, rounds=40):
         """Fit, predict, pair again with the radius of the fit until the pairs stay."""
-        limit_s = _crowding_limit(sources, cKDTree(sources))
         before = None
         result = None
         for _ in range(rounds):
             i, j = pairs
-            fit = self.fit(sources[i], reference.points[j])
+            fit = self.fit(points[i], reference.points[j])
             if fit is None:
                 return result
-            mapped = np.column_stack(fit.mapping(*sources.T))
-            radius = _GROW_RADIUS * fit.scatter * np.sqrt(1 + fit.leverage(*sources.T))
-            radius = np.maximum(radius, _SMALLEST_RADIUS)
-            radius[radius > limit_s] = 0.0
-            i, j, _ = find_edges(mapped, reference.tree, radius, limit=reference.limit)
-            keep, _ = one_to_one(i, j, len(sources), len(reference.points))
-            pairs = i[keep], j[keep]
+            mapped, leverage = _predict(points, fit, None)
+            radius = _GROW_RADIUS * fit.scatter * np.sqrt(1 + leverage)
+            pairs, radius = _pair(mapped, radius, limit, reference)
             result = fit, pairs, mapped, radius
-            key = hash((i[keep].tobytes(), j[keep].tobytes()))
+            key = _key(pairs)
             if key == before:
                 break
             before = key
         return result
 
-    def finish(self, sources, pairs, clock):
+    def grow_locally(self, points, limit, fit, pairs, *, rounds=12):
+        """Take off what neighbouring pairs have in common, and pair again until the pairs stay.
+
+        The pairs are nearly pure by now, so the polynomial is fitted without clipping: clipping
+        would keep it from following where the distortion is steepest, in the corners.
+        """
+        scatter, local, before = fit.scatter, None, None
+        reference = self.stars
+        for _ in range(rounds):
+            i, j = pairs
+            fit = self.fit(points[i], reference.points[j], clip=_LOOSE_CLIP) or fit
+            residual = reference.points[j] - np.column_stack(fit.mapping(*points[i].T))
+            local = LocalCorrection.if_worthwhile(points[i], residual)
+            scatter = fit.scatter
+            if local is not None:
+                scatter = scatter_of(*(residual - local(points[i], leave_out=True)[0]).T)
+            mapped, leverage = _predict(points, fit, local)
+            error = scatter * np.sqrt(1 + leverage)
+            # where stars are sparse a wider radius costs nothing, and lets the mapping follow what
+            # it could not foresee
+            near = find_nearest(reference.tree, mapped, 1)[1]
+            harmless = _HARMLESS * np.minimum(limit, reference.limit[near])
+            radius = np.maximum(_GROW_RADIUS * error, np.minimum(_WIDE_RADIUS * error, harmless))
+            pairs, _ = _pair(mapped, radius, limit, reference)
+            key = _key(pairs)
+            if key == before:
+                break
+            before = key
+        return fit, local, pairs, scatter
+
+    def finish(self, points, pairs, clock):
         """Grow over all stars, pair with the final radius, judge; None without evidence."""
-        step = max(1, -(-len(sources) // _FIT_SAMPLE))
-        fit = self.fit(sources[pairs[0]], self.stars.points[pairs[1]])
+        fit = self.fit(points[pairs[0]], self.stars.points[pairs[1]])
         if fit is None:
             return None
-        part = np.arange(0, len(sources), step)
-        mapped = np.column_stack(fit.mapping(*sources[part].T))
-        radius = np.maximum(
-            _GROW_RADIUS * fit.scatter * np.sqrt(1 + fit.leverage(*sources[part].T)),
-            _SMALLEST_RADIUS,
-        )
-        i, j, _ = find_edges(mapped, self.stars.tree, radius, limit=self.stars.limit)
-        keep, _ = one_to_one(i, j, len(part), len(self.stars.points))
-        grown = self.grow(sources[part], self.stars, (i[keep], j[keep]))
-        clock.lap("refine")
+        part = _sample(len(points))
+        some, limit = points[part], self.limit[part]
+        mapped, leverage = _predict(some, fit, None)
+        radius = _GROW_RADIUS * fit.scatter * np.sqrt(1 + leverage)
+        pairs, _ = _pair(mapped, radius, limit, self.stars)
+        grown = self.grow(some, limit, self.stars, pairs)
         if grown is None:
+            clock.lap("refine")
             return None
-        fit, local, pairs, scatter = self.grow_locally(sources[part], *grown[:2])
+        fit, local, pairs, scatter = self.grow_locally(some, limit, *grown[:2])
         clock.lap("refine")
-        mapped, leverage = _predict(sources, fit, local)
+        mapped, leverage = _predict(points, fit, local)
         radius = self.final_radius(mapped, (part[pairs[0]], pairs[1]), scatter, leverage)
         i, j, _ = find_edges(mapped, self.stars.tree, radius, limit=self.stars.limit)
-        keep, n_ambiguous = one_to_one(i, j, len(sources), len(self.stars.points))
+        keep, n_ambiguous = one_to_one(i, j, len(points), len(self.stars.points))
         pairs = i[keep], j[keep]
         clock.lap("pair")
         evidence = collect_evidence(
-            sources,
-            mapped,
-            radius,
-            self.stars.points,
-            self.stars.tree,
-            self.stars.limit,
-            fit.mapping,
-            pairs,
-            self.shape,
+            points, mapped, radius, self.stars, fit.mapping, pairs, self.shape
         )
         clock.lap("evidence")
         if evidence.missing(**self.rules):
             self.note_failure(evidence)
             return None
         return fit.mapping, evidence, pairs, n_ambiguous, scatter, float(np.median(radius))
-
-    def grow_locally(self, sources, fit, pairs, *, rounds=12):
-        """Take off what neighbouring pairs have in common, and pair again until the pairs stay.
-
-        The pairs are nearly pure by now, so the polynomial is fitted without clipping: clipping
-        would keep it from following where the distortion is steepest, in the corners.
-        """
-        limit_s = _crowding_limit(sources, cKDTree(sources))
-        scatter, local, before = fit.scatter, None, None
-        for _ in range(rounds):
-            i, j = pairs
-            fit = self.fit(sources[i], self.stars.points[j], clip=_LOOSE_CLIP) or fit
-            residual = self.stars.points[j] - np.column_stack(fit.mapping(*sources[i].T))
-            local = LocalCorrection.if_worthwhile(sources[i], residual)
-            scatter = fit.scatter
-            if local is not None:
-                scatter = scatter_of(*(residual - local(sources[i], leave_out=True)[0]).T)
-            mapped, leverage = _predict(sources, fit, local)
-            error = scatter * np.sqrt(1 + leverage)
-            # where stars are sparse a wider radius costs nothing, and lets the mapping follow what
-            # it could not foresee
-            near = self.stars.tree.query(mapped, workers=2)[1]
-            harmless = _HARMLESS * np.minimum(limit_s, self.stars.limit[near])
-            radius = np.maximum(_GROW_RADIUS * error, np.minimum(_WIDE_RADIUS * error, harmless))
-            radius = np.maximum(radius, _SMALLEST_RADIUS)
-            radius[radius > limit_s] = 0.0
-            i, j, _ = find_edges(mapped, self.stars.tree, radius, limit=self.stars.limit)
-            keep, _ = one_to_one(i, j, len(sources), len(self.stars.points))
-            pairs = i[keep], j[keep]
-            key = hash((pairs[0].tobytes(), pairs[1].tobytes()))
-            if key == before:
-                break
-            before = key
-        return fit, local, pairs, scatter
 
     def fit(self, points, reference, **options):
         """Fit a smooth mapping in the frame's own units."""
@@ -505,7 +486,7 @@ def _first_pairs(sources, reference, hypotheses):
     pairs = _neighbour_pairs(sources, reference, hypotheses)
     yield pairs
     if len(hypotheses) > 1:
-        agreeing = _agreeing_pairs(sources, reference.points, pairs)
+        agreeing = _agreeing_pairs(sources.points, reference.points, pairs)
         if agreeing is not None:
             yield agreeing
         yield _neighbour_pairs(sources, reference, hypotheses.take(slice(0, 1)))
@@ -537,14 +518,13 @@ def _agreeing_pairs(sources, reference, pairs):
 
 def _neighbour_pairs(sources, reference, hypotheses):
     """First pairs: the stars of a group of hypotheses and neighbours that coincide."""
-    tree = cKDTree(sources)
-    log_d, angle, neighbour = neighbour_pattern(sources, tree, hypotheses.source, N_NEIGHBOURS)
+    log_d, angle, neighbour = neighbour_pattern(sources.tree, hypotheses.source, N_NEIGHBOURS)
     distance = np.exp(log_d + hypotheses.log_scale[:, None])
     angle = angle + hypotheses.rotation[:, None]
     place = reference.points[hypotheses.reference][:, None, :] + np.stack(
         [distance * np.cos(angle), distance * np.sin(angle)], axis=-1
     )
-    gap, found = reference.tree.query(place.reshape(-1, 2), workers=2)
+    gap, found = find_nearest(reference.tree, place.reshape(-1, 2), 1)
     gap, found = gap.reshape(distance.shape), found.reshape(distance.shape)
     good = np.isfinite(distance) & (gap <= 0.7 * hypotheses.width[:, None] * distance)
     relative = np.where(good, gap / distance, np.inf)
@@ -558,6 +538,26 @@ def _neighbour_pairs(sources, reference, hypotheses):
         keep = order[first]
         i, j, relative = i[keep], j[keep], relative[keep]
     return i, j
+
+
+def _sample(n, extra=()):
+    """Rows of a list that are enough for a fit, in order, with some that must be among them."""
+    step = max(1, -(-n // _FIT_SAMPLE))
+    rows = np.arange(0, n, step)
+    return np.union1d(rows, extra).astype(int) if step > 1 and len(extra) else rows
+
+
+def _pair(mapped, radius, limit, reference):
+    """Unambiguous pairs while the mapping grows, and the radii that were used."""
+    radius = np.maximum(radius, _SMALLEST_RADIUS)
+    radius[radius > limit] = 0.0
+    i, j, _ = find_edges(mapped, reference.tree, radius, limit=reference.limit)
+    keep, _ = one_to_one(i, j, len(mapped), len(reference.points))
+    return (i[keep], j[keep]), radius
+
+
+def _key(pairs):
+    return hash((pairs[0].tobytes(), pairs[1].tobytes()))
 
 
 def _predict(sources, fit, local):
@@ -575,5 +575,5 @@ def _crowding_limit(points, tree):
     k = min(6, tree.n - 1)
     if k < 1:
         return np.full(tree.n, np.inf)
-    distance = tree.query(points, k=[k + 1], workers=2)[0][:, 0]
+    distance = find_nearest(tree, points, [k + 1])[0][:, 0]
     return distance * np.sqrt(_MAX_CROWDING / k)
