@@ -32,7 +32,7 @@ from wpdc_gwcs.fitting import (
     robust_sigma,
     solve_linear,
 )
-from wpdc_gwcs.lookup import N_FOLDS, ResidualMap, build_lookup_table
+from wpdc_gwcs.lookup import N_FOLDS, ResidualMap, build_lookup_table, choose_table
 from wpdc_gwcs.models import PVPolynomial, deproject, project, pv_terms
 from wpdc_gwcs.solution import DistortionSolution
 
@@ -540,26 +540,23 @@ class _Solver:
             z = self.polynomial_positions(self.pairs.x, self.pairs.y)
             if lut != "none":
                 self.residual_map = self._residual_map(z, folds)
-                self.table, info = build_lookup_table(
+                if self.rounds == 2:
+                    choice, candidates = choose_table(self.residual_map, lut=lut)
+                self.table, self.table_info = build_lookup_table(
                     self.residual_map, n_grid, choice=choice, lut=lut, draft=True
                 )
-                if choice is None:
-                    choice, self.table_info = info.choice, info
             self.settle_attitudes(z)
             if self.rounds == 1:
-                # The surface of the alignment may have left structure that the table takes: then
-                # the errors were too large, and the smoothing chosen with them too.
-                before = self.sigma
+                # The surface of the alignment may have left structure that the table takes: the
+                # errors are only now what they are, and the table's settings are chosen with them.
                 self.rescale_errors()
-                if np.abs(np.median(self.sigma[:, self.kept] / before[:, self.kept]) - 1) > 0.05:
-                    choice = None
             places, moved = self._places(places)
             if moved < _TOLERANCE:
                 break
         if self.table is not None:
             self.residual_map = self._residual_map(z, folds)
             self.table, info = build_lookup_table(self.residual_map, n_grid, choice=choice, lut=lut)
-            self.table_info = replace(info, candidates=self.table_info.candidates)
+            self.table_info = replace(info, candidates=candidates)
             self.settle_attitudes(z)
         self.rescale_errors()
         log.info("instrument solved in %d rounds from %d pairs", self.rounds, self.kept.sum())
@@ -586,18 +583,18 @@ class _Solver:
         choice, places = None, None
         for self.rounds in range(1, _MAX_ROUNDS + 1):
             self.residual_map = solution.residual_map + self._residual_map(z, folds)
-            self.table, info = build_lookup_table(
+            if choice is None:
+                choice, candidates = choose_table(self.residual_map)
+            self.table, self.table_info = build_lookup_table(
                 self.residual_map, n_grid, choice=choice, draft=True
             )
-            if choice is None:
-                choice, self.table_info = info.choice, info
             self.settle_attitudes(z)
             places, moved = self._places(places)
             if moved < _TOLERANCE:
                 break
         if self.table is not None:
             self.table, info = build_lookup_table(self.residual_map, n_grid, choice=choice)
-            self.table_info = replace(info, candidates=self.table_info.candidates)
+            self.table_info = replace(info, candidates=candidates)
             self.settle_attitudes(z)
         self.rescale_errors()
 

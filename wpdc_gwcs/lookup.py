@@ -7,7 +7,7 @@
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
@@ -17,7 +17,7 @@ from scipy.linalg import eigh, lapack, qr
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.models import LookupTable
 
-__all__ = ["ResidualMap", "TableChoice", "build_lookup_table"]
+__all__ = ["ResidualMap", "TableChoice", "TableInfo", "build_lookup_table", "choose_table"]
 
 log = logging.getLogger(__name__)
 
@@ -351,6 +351,9 @@ _MAX_DEGREE = 7
 _FULL_RANK_EPSILON = 4.5
 _LOW_RANK_TOLERANCE = 1e-11
 
+# Smoothings tried, in units of the largest eigenvalue: from following every bin to all but none.
+_SMOOTHINGS = 10.0 ** np.arange(-10.0, 3.01, 0.5)
+
 # Nodes of the pilot surface along each axis: twice as dense as the table's for the paper's
 # detector.
 _PILOT_NODES = 71
@@ -382,8 +385,8 @@ def build_lookup_table(
     method : {'cubic', 'linear'}, optional
         How the table interpolates between its nodes.
     draft : bool, optional
-        Interpolate bins twice as large, without uncertainty: a small part of the time, for
-        iterations.
+        Interpolate bins twice as large, without uncertainty and with settings that only one kernel
+        was tried for: a small part of the time, for iterations.
 
     Returns
     -------
@@ -442,22 +445,18 @@ def build_lookup_table(
         raise ValueError(f"n_grid must be between 4 and 1000, got {n_grid}")
     if not isinstance(residual_map, ResidualMap):
         residual_map = _assign_folds(residual_map)
-    if lut == "none" or (choice is not None and choice.kernel == "none"):
-        return None, TableInfo(TableChoice("none"), (), None, np.nan)
-    n = residual_map.n_stars
-    if n < _MIN_STARS_TABLE:
-        if lut == "always" or choice is not None:
-            raise FitError(f"{n} stars cannot carry a look-up table, {_MIN_STARS_TABLE} are needed")
-        return None, TableInfo(TableChoice("none"), (), None, np.nan)
-
-    coarse = residual_map.coarsen()
     candidates = ()
+    if lut == "none":
+        choice = TableChoice("none")
+    elif choice is None and not draft:
+        choice, candidates = choose_table(residual_map, lut=lut)
+    elif residual_map.n_stars < _MIN_STARS_TABLE:
+        choice = TableChoice("none")
+    coarse = residual_map.coarsen()
     if choice is None:
-        choice, candidates = _choose(coarse, allow_none=lut == "auto")
-        log.info("look-up table: %s", choice)
-        if choice.kernel == "none":
-            return None, TableInfo(choice, candidates, None, np.nan)
-
+        choice = _first_choice(_Bins(coarse))
+    if choice.kernel == "none":
+        return None, TableInfo(choice, candidates, None, np.nan)
     bins = _Bins(coarse)
     pilot = _pilot(bins, choice)
     ny, nx = residual_map.image_shape
@@ -473,6 +472,36 @@ def build_lookup_table(
     return LookupTable(x_grid, y_grid, dx, dy, method=method), TableInfo(
         choice, candidates, sigma, chi2
     )
+
+
+def choose_table(residual_map, *, lut="auto"):
+    """Kernel, degree and smoothing of a look-up table, chosen from the data.
+
+    Parameters
+    ----------
+    residual_map : ResidualMap
+        Residuals of one detector.
+    lut : {'auto', 'always'}, optional
+        Whether the answer may be that no table predicts best.
+
+    Returns
+    -------
+    choice : TableChoice
+        The best settings, for `build_lookup_table`.
+    candidates : tuple of TableChoice
+        All that were compared by cross-validation, best first.
+
+    Raises
+    ------
+    FitError
+        If a table is asked for and the map holds too few stars.
+    """
+    n = residual_map.n_stars
+    if n < _MIN_STARS_TABLE:
+        if lut == "always":
+            raise FitError(f"{n} stars cannot carry a look-up table, {_MIN_STARS_TABLE} are needed")
+        return TableChoice("none"), ()
+    return _choose(residual_map.coarsen(), allow_none=lut == "auto")
 
 
 @dataclass(frozen=True, eq=False)
@@ -601,7 +630,7 @@ class _Spectrum:
     polynomials of higher degree are added by generalised least squares.
     """
 
-    def __init__(self, bins, value, kernel, epsilon, least_degree):
+    def __init__(self, bins, kernel, epsilon, least_degree):
         root = np.sqrt(bins.weight)
         p = _n_terms(least_degree)
         basis = _polynomials(bins.u, bins.v, _MAX_DEGREE) * root[:, None]
@@ -625,24 +654,27 @@ class _Spectrum:
             k *= root
             k = rotate(rotate(k), "R", "N")[p:, p:]
             eigenvalues, vectors = eigh(k, overwrite_a=True, driver="evd", check_finite=False)
-        target = rotate(np.hstack([value * root[:, None], basis[:, p:]]))[p:]
-        self.least_degree, self.n = least_degree, len(bins)
+        self.kernel, self.epsilon, self.least_degree = kernel, epsilon, least_degree
+        self.n = len(bins)
         self.eigenvalues = np.maximum(eigenvalues, 0.0)
-        self.modes = vectors.T @ target
-        # What no mode reaches is all residual.
-        self.rest = target.T @ target - self.modes.T @ self.modes
-        self.n_rest = len(target) - len(eigenvalues)
+        self._vectors, self._basis, self._root = vectors, basis[:, p:], root
+        self._rotate = lambda matrix: rotate(matrix)[p:]
 
-    def scores(self, smoothing, degrees):
+    def scores(self, value, smoothing, degrees):
         """Generalised cross-validation and effective parameters, one row per degree."""
+        target = self._rotate(np.hstack([value * self._root[:, None], self._basis]))
+        modes = self._vectors.T @ target
+        # What no mode reaches is all residual.
+        rest = target.T @ target - modes.T @ modes
+        n_rest = len(target) - len(modes)
         g = smoothing[:, None] / (self.eigenvalues + smoothing[:, None])
-        q = self.modes.shape[1]
+        q = modes.shape[1]
         # Products of data (first two) and polynomials, once and twice through the residual matrix.
-        products = (self.modes[:, :, None] * self.modes[:, None, :]).reshape(-1, q * q)
-        once = (g @ products).reshape(-1, q, q) + self.rest
-        twice = (g**2 @ products).reshape(-1, q, q) + self.rest
+        products = (modes[:, :, None] * modes[:, None, :]).reshape(-1, q * q)
+        once = (g @ products).reshape(-1, q, q) + rest
+        twice = (g**2 @ products).reshape(-1, q, q) + rest
         square = twice[:, 0, 0] + twice[:, 1, 1]
-        trace = g.sum(1) + self.n_rest
+        trace = g.sum(1) + n_rest
         for degree in degrees:
             e = slice(2, 2 + _n_terms(degree) - _n_terms(self.least_degree))
             inverse = np.linalg.pinv(once[:, e, e], rcond=1e-13, hermitian=True)
@@ -662,54 +694,54 @@ def _low_rank(kernel):
     return out
 
 
-def _smoothings(spectrum):
-    """Half-decade steps from barely to wholly smoothed."""
-    return spectrum.eigenvalues.max() * 10.0 ** np.arange(-10.0, 3.01, 0.5)
-
-
 def _choose(coarse, *, allow_none):
     """Kernel, degree and smoothing by generalised cross-validation, then by groups of exposures."""
     bins = _Bins(coarse)
-    # A first surface for the curvature within bins; it needs no more than the right order of
-    # magnitude.
-    spectrum = _Spectrum(bins, bins.value, "quintic", 1.0, 2)
-    first = _best_of(spectrum, "quintic", 1.0, bins)
-    value = bins.debiased(_pilot(bins, first[0]))
-
-    found = []
+    quintic = _Spectrum(bins, "quintic", 1.0, 2)
+    pilot = _pilot(bins, _first_choice(bins, quintic))
+    value = bins.debiased(pilot)
+    found = _best_of(quintic, value)
+    del quintic
     for kernel, epsilons, least_degree in _KERNELS:
         for epsilon in epsilons:
-            spectrum = _Spectrum(bins, value, kernel, epsilon, least_degree)
-            found += _best_of(spectrum, kernel, epsilon, bins)
+            found += _best_of(_Spectrum(bins, kernel, epsilon, least_degree), value)
     found.sort(key=lambda c: c.score)
-    shortlist = _distinct(found)
-    candidates = [TableChoice("none"), *shortlist]
-    scores = _cross_validate(coarse, candidates, first[0])
+    candidates = [TableChoice("none"), *_distinct(found)]
+    scores = _cross_validate(coarse, candidates, pilot)
     ranked = sorted(
-        (
-            TableChoice(c.kernel, c.degree, c.smoothing, c.epsilon, float(s), c.freedom)
-            for c, s in zip(candidates, scores)
-        ),
-        key=lambda c: c.score,
+        (replace(c, score=float(s)) for c, s in zip(candidates, scores)), key=lambda c: c.score
     )
     best = next(c for c in ranked if allow_none or c.kernel != "none")
+    log.info("look-up table: %s", best)
     return best, tuple(ranked)
 
 
-def _best_of(spectrum, kernel, epsilon, bins):
+def _first_choice(bins, spectrum=None):
+    """Reasonable settings at once: one kernel, generalised cross-validation."""
+    if spectrum is None:
+        spectrum = _Spectrum(bins, "quintic", 1.0, 2)
+    return _best_of(spectrum, bins.value)[0]
+
+
+def _best_of(spectrum, value):
     """Best smoothing of each degree, best first."""
     found = []
-    smoothing = _smoothings(spectrum)
+    smoothing = spectrum.eigenvalues.max() * _SMOOTHINGS
     degrees = [
-        d for d in range(spectrum.least_degree, _MAX_DEGREE + 1) if 2 * _n_terms(d) <= len(bins)
+        d for d in range(spectrum.least_degree, _MAX_DEGREE + 1) if 2 * _n_terms(d) <= spectrum.n
     ]
-    for degree, (score, freedom) in zip(degrees, spectrum.scores(smoothing, degrees)):
+    for degree, (score, freedom) in zip(degrees, spectrum.scores(value, smoothing, degrees)):
         # A smoother that follows nearly every bin has no residuals to be judged by.
-        score = np.where(freedom < 0.9 * len(bins), score, np.inf)
+        score = np.where(freedom < 0.9 * spectrum.n, score, np.inf)
         k = int(np.argmin(score))
         found.append(
             TableChoice(
-                kernel, degree, float(smoothing[k]), epsilon, float(score[k]), float(freedom[k])
+                spectrum.kernel,
+                degree,
+                float(smoothing[k]),
+                spectrum.epsilon,
+                float(score[k]),
+                float(freedom[k]),
             )
         )
     return sorted(found, key=lambda c: c.score)
@@ -723,7 +755,7 @@ def _distinct(found):
     return list(kept.values())[:_N_SHORTLIST]
 
 
-def _cross_validate(coarse, candidates, first):
+def _cross_validate(coarse, candidates, pilot):
     """Mean square normalised residual of left-out groups for each candidate."""
     folds = coarse.folds
     total = np.zeros(len(candidates))
@@ -733,7 +765,6 @@ def _cross_validate(coarse, candidates, first):
         bins = _Bins(coarse)
         raw = np.sum(bins.value**2 * bins.weight[:, None]) / (2 * len(bins))
         return np.array([raw if c.kernel == "none" else c.score for c in candidates])
-    pilot = _pilot(_Bins(coarse), first)
     n = 0
     for fold in folds:
         train, test = _Bins(coarse.without(fold)), _Bins(coarse.only(fold))
