@@ -26,7 +26,7 @@ from gwcs import WCS
 from gwcs import coordinate_frames as cf
 
 from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, TangentSky
-from wpdc_gwcs.models.blocks import BLOCK_SIZE, run_blocks
+from wpdc_gwcs.models.blocks import BLOCK_SIZE, evaluate_blocks, run_blocks
 from wpdc_gwcs.models.mapping import PlaneMap, fit_polynomial
 
 __all__ = ["DetectorWCS", "build_wcs", "sky_map", "to_stock_wcs"]
@@ -45,8 +45,7 @@ class DetectorWCS(WCS):
       image of the detector is not a rectangle on the sky, up to all of them at a pole.  Every
       answer comes from an exact inverse; those that lie outside the bounding box are masked, both
       coordinates together, and answers within 1e-6 px of the rim count as on it.
-    - The two steps are evaluated in one pass, and the bounding box is applied afterwards, in one
-      pass too.
+    - The two steps and the bounding box are evaluated in one pass.
 
     All else, including the parameters, is that of the base class.
     """
@@ -82,14 +81,17 @@ class DetectorWCS(WCS):
         result : tuple of array_like
             Coordinates in the last frame.
         """
-        if any(isinstance(value, u.Quantity) for value in args):
+        transform = self.forward_transform
+        plain = len(args) == 2 and not any(isinstance(value, u.Quantity) for value in args)
+        if kwargs or not plain or not isinstance(transform, DetectorToSky):
             return super().__call__(
                 *args, with_bounding_box=with_bounding_box, fill_value=fill_value, **kwargs
             )
-        result = super().__call__(*args, with_bounding_box=False, **kwargs)
-        if not with_bounding_box:
-            return result
-        return self._mask(args, result, fill_value)
+        box = self.bounding_box if with_bounding_box else None
+        if box is not None:
+            box = box.bounding_box(order="F")
+        result = evaluate_blocks(transform.block_function(box=box, fill_value=fill_value), *args)
+        return tuple(value if value.ndim else value.item() for value in result)
 
     def outside_footprint(self, world_arrays):
         """Return the positions as they are: the inverse itself tells what is outside.
@@ -122,28 +124,18 @@ class DetectorWCS(WCS):
             Pixel coordinates; those within 1e-6 px outside the rim are put on it.
         """
         limits = self.bounding_box.bounding_box(order="F")
-        snapped = []
-        for value, (low, high) in zip(pixel_arrays, limits, strict=True):
-            # NaN stays NaN.
-            near = np.clip(value, low, high)
-            snapped.append(np.where(np.abs(near - value) <= _RIM_PX, near, value)[()])
-        return self._mask(snapped, snapped, fill_value)
-
-    def _mask(self, pixels, values, fill_value):
-        """Replace the values of pixels outside the bounding box."""
-        box = self.bounding_box
-        if box is None:
-            return values
-        limits = box.bounding_box(order="F")
-        pixels = [np.asarray(pixel) for pixel in pixels]
+        values = [np.asarray(value) for value in pixel_arrays]
         if all(
-            pixel.size and pixel.min() >= low and pixel.max() <= high
-            for pixel, (low, high) in zip(pixels, limits, strict=True)
+            value.size and value.min() >= low and value.max() <= high
+            for value, (low, high) in zip(values, limits, strict=True)
         ):
-            return values
+            return tuple(pixel_arrays)
         outside = False
-        for pixel, (low, high) in zip(pixels, limits, strict=True):
-            outside = outside | ~((pixel >= low) & (pixel <= high))
+        for k, (low, high) in enumerate(limits):
+            # NaN stays NaN, and is outside.
+            near = np.clip(values[k], low, high)
+            values[k] = np.where(np.abs(near - values[k]) <= _RIM_PX, near, values[k])
+            outside = outside | ~((values[k] >= low) & (values[k] <= high))
         return tuple(np.where(outside, fill_value, value)[()] for value in values)
 
 

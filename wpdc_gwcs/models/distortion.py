@@ -312,8 +312,15 @@ class DetectorToSky(Model):
         """
         return evaluate_blocks(self.block_function(), x, y)
 
-    def block_function(self):
+    def block_function(self, *, box=None, fill_value=np.nan):
         """Return the map as a function of contiguous 1-D float64 arrays, without model overhead.
+
+        Parameters
+        ----------
+        box : ((float, float), (float, float)), optional
+            Least and greatest x, least and greatest y.
+        fill_value : float, optional
+            What points outside the box are mapped to.
 
         Returns
         -------
@@ -323,7 +330,22 @@ class DetectorToSky(Model):
         undistort = self.distortion._plane_map()
         sky = self.sky
         to_sky = sky._block_function(sky.crpix.value, sky.cd.value, sky.crval.value)
-        return lambda x, y: to_sky(*undistort(x, y))
+        if box is None:
+            return lambda x, y: to_sky(*undistort(x, y))
+        (x_low, x_high), (y_low, y_high) = box
+
+        def function(x, y):
+            ra, dec = to_sky(*undistort(x, y))
+            # Written so that NaN counts as outside.
+            if len(x) and not (
+                x.min() >= x_low and x.max() <= x_high and y.min() >= y_low and y.max() <= y_high
+            ):
+                outside = ~((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high))
+                ra[outside] = fill_value
+                dec[outside] = fill_value
+            return ra, dec
+
+        return function
 
     @property
     def inverse(self):

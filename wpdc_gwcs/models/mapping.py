@@ -242,16 +242,18 @@ class CellGrid:
         s *= 1.0 / self.x_step
         t = y - self.y_low
         t *= 1.0 / self.y_step
-        i = s.astype(np.intp)
-        j = t.astype(np.intp)
-        # The last edge belongs to the last cell.
+        i, j = np.floor(s), np.floor(t)
+        # The last edge belongs to the last cell, a margin to the outermost ones.
         np.minimum(i, self.nx - 1, out=i)
         np.minimum(j, self.ny - 1, out=j)
+        if margin:
+            np.maximum(i, 0, out=i)
+            np.maximum(j, 0, out=j)
         s -= i
         t -= j
         j *= self.nx
         j += i
-        return j, s, t, outside
+        return j.astype(np.intp), s, t, outside
 
     def evaluate(self, cell, s, t):
         """Return both outputs."""

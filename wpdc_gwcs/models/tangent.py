@@ -52,9 +52,11 @@ class _Tangent:
 
     def deproject(self, xi, eta):
         """Plane in degrees to the sky in degrees; right ascension from 0 to 360."""
-        xi = xi * (np.pi / 180)
+        return self.deproject_radians(xi * (np.pi / 180), eta * (np.pi / 180))
+
+    def deproject_radians(self, xi, eta):
+        """Plane in radians, which is overwritten, to the sky in degrees."""
         # Axes of the tangent plane's point: toward RA0 in the equator's plane, east, and north.
-        eta = eta * (np.pi / 180)
         ahead = eta * -self.sin0
         ahead += self.cos0
         north = eta
@@ -245,7 +247,8 @@ class TangentSky(_Linear):
         return evaluate_blocks(self._block_function(crpix, cd, crval), x, y)
 
     def _block_function(self, crpix, cd, crval):
-        (x0, y0), ((m00, m01), (m10, m11)), crval = self._arrays(crpix, cd, crval)
+        (x0, y0), cd, crval = self._arrays(crpix, cd, crval)
+        (m00, m01), (m10, m11) = np.radians(cd)
         tangent = _Tangent(crval)
 
         def to_sky(x, y):
@@ -255,7 +258,7 @@ class TangentSky(_Linear):
             u *= m10
             v *= m11
             v += u
-            return tangent.deproject(xi, v)
+            return tangent.deproject_radians(xi, v)
 
         return to_sky
 
