@@ -1,0 +1,11 @@
+"""Positions by effective-PSF fitting: the PSF from the frame's own stars, then all sources at once.
+
+::
+
+    Background, sources --build_epsf--> photutils ImagePSF or GriddedPSFModel
+    Background, sources, PSF --fit_centroids--> sources with x, y, errors, flux, chi2
+"""
+
+from wpdc_gwcs.centroids._high_level import build_epsf, fit_centroids
+
+__all__ = ["build_epsf", "fit_centroids"]

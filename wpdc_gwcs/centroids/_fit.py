@@ -1,0 +1,278 @@
+"""Weighted least squares for the position and flux of many stars at once."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import nnls
+
+from wpdc_gwcs.centroids._profile import cutouts
+
+__all__ = ["Noise", "StarFits", "estimate_noise", "fit_stars", "render"]
+
+# Stars fitted at a time: bounds the memory for their pixels.
+_CHUNK = 4000
+
+_MAX_STEP = 0.5  # px per iteration
+_MAX_ITERATIONS = 12
+_CONVERGED = 3e-5  # px
+
+# Least reduced chi2 per pixel that counts as an outlier when the noise is estimated.
+_CLIP = 5.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    r"""Variance of a pixel: background, photons, and what the profile does not describe.
+
+    Parameters
+    ----------
+    inverse_gain : float
+        Counts per electron.
+    mismatch : float
+        Error of the profile in every pixel, relative to its value.
+
+    Notes
+    -----
+    :math:`\sigma^2 = \sigma_\mathrm{sky}^2 + m / g + (\epsilon m)^2` with m the model's counts.
+    """
+
+    inverse_gain: float = 0.0
+    mismatch: float = 0.02
+
+    def variance(self, sky_variance, model):
+        """Variance for pixels of given background variance and model counts."""
+        model = np.maximum(model, 0)
+        return sky_variance + model * self.inverse_gain + (self.mismatch * model) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class StarFits:
+    """Result of `fit_stars`: one entry per star.
+
+    Parameters
+    ----------
+    x, y, flux : (N,) ndarray
+        Position in px and flux in counts.
+    covariance : (N, 3, 3) ndarray
+        Of x, y and flux; NaN where the fit failed.
+    chi2 : (N,) ndarray
+        Chi square per degree of freedom.
+    valid : (N,) bool ndarray
+        True where the fit converged.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    flux: np.ndarray
+    covariance: np.ndarray
+    chi2: np.ndarray
+    valid: np.ndarray
+
+
+def fit_stars(image, rms, mask, profile, noise, x, y, flux, *, radius, own=None):
+    """Fit position and flux of stars, each on the pixels within a radius of its start.
+
+    Parameters
+    ----------
+    image, rms : (ny, nx) ndarray
+        Image without background, and the noise of the background.
+    mask : (ny, nx) bool ndarray or None
+        True where a pixel must not be used.
+    profile : Profile
+        The PSF.
+    noise : Noise
+        Variance of the pixels.
+    x, y, flux : (N,) ndarray
+        Start values.
+    radius : float
+        Radius in px of the pixels used.
+    own : (x, y, flux) tuple of (N,) ndarray, optional
+        Models of these stars were subtracted from the image: each star gets its own back.
+
+    Returns
+    -------
+    StarFits
+        The fits.
+    """
+    parts = []
+    for start in range(0, max(len(x), 1), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        star = (x[rows], y[rows], flux[rows])
+        mine = None if own is None else tuple(column[rows] for column in own)
+        parts.append(_fit_chunk(image, rms, mask, profile, noise, star, radius, mine))
+    return StarFits(*(np.concatenate(columns) for columns in zip(*parts)))
+
+
+def _fit_chunk(image, rms, mask, profile, noise, star, radius, own):
+    x, y, flux = (np.array(v, dtype=float) for v in star)
+    xc, yc = np.rint(x).astype(int), np.rint(y).astype(int)
+    half = int(np.ceil(radius))
+    pixels, use, sky = _pixels(image, rms, mask, xc, yc, half, radius)
+    if own is not None:
+        weights = profile.node_weights(own[0], own[1])
+        model = profile.evaluate(own[0] - xc, own[1] - yc, half, weights, gradient=False)[0]
+        pixels += own[2][:, None] * model
+    weights = profile.node_weights(x, y) if len(profile.coefficients) > 1 else None
+    flux = np.maximum(flux, 1e-6)
+    x0, y0 = x.copy(), y.copy()
+    converged = np.zeros(len(x), bool)
+    active = np.arange(len(x))
+    for _ in range(_MAX_ITERATIONS):
+        w = None if weights is None else weights[active]
+        basis = profile.evaluate(x[active] - xc[active], y[active] - yc[active], half, w)
+        step, *_rest = _normal_step(
+            basis, flux[active], pixels[active], use[active], sky[active], noise
+        )
+        shift = np.clip(step[:, :2], -_MAX_STEP, _MAX_STEP)
+        x[active] += shift[:, 0]
+        y[active] += shift[:, 1]
+        # A flux that would turn negative is made smaller step by step.
+        flux[active] = np.maximum(flux[active] + step[:, 2], 0.2 * flux[active])
+        away = np.hypot(x[active] - x0[active], y[active] - y0[active]) > radius
+        done = (np.abs(shift).max(axis=1, initial=0) < _CONVERGED) & (
+            np.abs(step[:, 2]) < 1e-4 * flux[active]
+        )
+        converged[active[done & ~away]] = True
+        active = active[~done & ~away]
+        if len(active) == 0:
+            break
+    else:
+        # Slow but close enough: what is left is far below the error.
+        converged[active] = np.abs(shift[~done & ~away]).max(axis=1, initial=0) < 3e-3
+    basis = profile.evaluate(x - xc, y - yc, half, weights)
+    _step, covariance, chi2 = _normal_step(basis, flux, pixels, use, sky, noise)
+    positive = np.einsum("sii->si", covariance).min(axis=1, initial=np.inf) > 0
+    valid = converged & positive & np.isfinite(chi2)
+    covariance[~valid] = np.nan
+    return x, y, flux, covariance, chi2, valid
+
+
+def _pixels(image, rms, mask, xc, yc, half, radius):
+    """Pixels, which of them to use, and their background's variance."""
+    pixels, use = cutouts(image, xc, yc, half)
+    step = np.arange(-half, half + 1)
+    use &= (np.hypot(step[:, None], step) <= radius).ravel()
+    if mask is not None:
+        use &= ~cutouts(mask, xc, yc, half)[0]
+    return pixels.astype(float), use, cutouts(rms, xc, yc, half)[0].astype(float) ** 2
+
+
+def _normal_step(basis, flux, pixels, use, sky, noise):
+    """Gauss-Newton step (N, 3), covariance (N, 3, 3) and reduced chi square."""
+    model = flux[:, None] * basis[0]
+    weight = use / noise.variance(sky, model)
+    residual = pixels - model
+    jacobian = np.stack([flux[:, None] * basis[1], flux[:, None] * basis[2], basis[0]], axis=1)
+    weighted = jacobian * weight[:, None]
+    normal = weighted @ jacobian.transpose(0, 2, 1)
+    right = (weighted @ residual[:, :, None])[:, :, 0]
+    # Scaled to a unit diagonal, so that "singular" has one meaning for all fluxes.
+    scale = np.sqrt(np.einsum("sii->si", normal))
+    empty = ~(scale > 0).all(axis=1)
+    scale[empty] = 1
+    scaled = normal / scale[:, :, None] / scale[:, None, :]
+    bad = empty | ~(np.linalg.det(scaled) > 1e-6)
+    scaled[bad] = np.eye(3)
+    covariance = np.linalg.inv(scaled) / scale[:, :, None] / scale[:, None, :]
+    step = (covariance @ right[:, :, None])[:, :, 0]
+    step[bad] = 0
+    covariance[bad] = np.nan
+    freedom = np.maximum(use.sum(axis=1) - 3, 1)
+    return step, covariance, (weight * residual**2).sum(axis=1) / freedom
+
+
+def render(shape, profile, x, y, flux, *, faintest=0.0):
+    """Image of the stars' models.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Shape of the image.
+    profile : Profile
+        The PSF.
+    x, y, flux : (N,) ndarray
+        The stars.
+    faintest : float, optional
+        Counts that may be left out in the wings of a star; faint stars are drawn smaller.
+
+    Returns
+    -------
+    (ny, nx) float32 ndarray
+        The image.
+    """
+    image = np.zeros(shape, dtype=np.float32)
+    flat = image.reshape(-1)
+    samples = np.abs(profile.samples()).max(axis=0)
+    center = samples.shape[0] // 2
+    full = profile.radius - 1
+    # Greatest value at or beyond every distance along the axes.
+    distance = np.abs(np.arange(samples.shape[0]) - center) / profile.oversampling
+    line = np.maximum(samples[center], samples[:, center])
+    sizes = np.unique(np.minimum([3, 5, 8, 12, full], full))
+    level = np.array([line[distance >= size].max() for size in sizes[:-1]])
+    group = (flux[:, None] * level > faintest).sum(axis=1)
+    for g, half in enumerate(sizes):
+        rows = np.flatnonzero(group == g)
+        size = max(1, _CHUNK * 100 // (2 * half + 1) ** 2)
+        for start in range(0, len(rows), size):
+            k = rows[start : start + size]
+            xc, yc = np.rint(x[k]).astype(int), np.rint(y[k]).astype(int)
+            weights = profile.node_weights(x[k], y[k])
+            model = profile.evaluate(x[k] - xc, y[k] - yc, half, weights, gradient=False)[0]
+            step = np.arange(-half, half + 1)
+            iy, ix = yc[:, None] + step, xc[:, None] + step
+            inside = ((iy >= 0) & (iy < shape[0]))[:, :, None]
+            inside = (inside & ((ix >= 0) & (ix < shape[1]))[:, None, :]).reshape(model.shape)
+            index = (iy[:, :, None] * shape[1] + ix[:, None, :]).reshape(model.shape)
+            value = (flux[k, None] * model).astype(np.float32)
+            np.add.at(flat, index[inside], value[inside])
+    return image
+
+
+def estimate_noise(image, rms, mask, profile, noise, x, y, flux, *, radius, gain=None):
+    """Learn from residuals of well measured stars how far the profile is off, and the gain.
+
+    Parameters
+    ----------
+    image, rms, mask, profile, noise, x, y, flux, radius
+        As for `fit_stars`; stars where the fit has converged.
+    gain : float, optional
+        Electrons per count; estimated if not given.
+
+    Returns
+    -------
+    Noise
+        Noise with the new gain and mismatch.
+    """
+    xc, yc = np.rint(x).astype(int), np.rint(y).astype(int)
+    half = int(np.ceil(radius))
+    pixels, use, sky = _pixels(image, rms, mask, xc, yc, half, radius)
+    basis = profile.evaluate(x - xc, y - yc, half, profile.node_weights(x, y))
+    model = flux[:, None] * basis[0]
+    use &= model > np.sqrt(sky)
+    weight = use / noise.variance(sky, model)
+    jacobian = np.stack([model * 0 + flux[:, None] * b for b in basis[1:]] + [basis[0]], axis=1)
+    normal = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
+    good = use.sum(axis=1) >= 6
+    normal[~good] = np.eye(3)
+    # A fit takes part of the scatter away, most where few pixels decide: the leverage.
+    leverage = weight * np.einsum("sip,sij,sjp->sp", jacobian, np.linalg.pinv(normal), jacobian)
+    use &= good[:, None] & (leverage < 0.8)
+    if np.count_nonzero(use) < 50:
+        return replace(noise, inverse_gain=0.0 if gain is None else 1 / gain)
+    residual2 = ((pixels - model) ** 2)[use] / (1 - leverage[use])
+    model, sky = model[use], sky[use]
+    order = np.argsort(model)
+    bins = np.array_split(order, int(np.clip(len(order) // 50, 1, 40)))
+    # 1.4826 MAD squared = median of the squares / 0.4549
+    measured = np.array([np.median(residual2[b]) for b in bins]) / 0.4549
+    m, s = (np.array([np.mean(v[b]) for b in bins]) for v in (model, sky))
+    fixed = s if gain is None else s + m / gain
+    columns = np.stack(([m] if gain is None else []) + [m**2], axis=1)
+    # The error of a variance is proportional to it: relative residuals, reweighted by the model.
+    expected = np.maximum(measured, s)
+    for _ in range(5):
+        solution, _norm = nnls(columns / expected[:, None], (measured - fixed) / expected)
+        expected = fixed + columns @ solution
+    inverse_gain = solution[0] if gain is None else 1 / gain
+    return Noise(float(inverse_gain), float(np.sqrt(solution[-1])))

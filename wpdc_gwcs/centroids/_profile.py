@@ -1,0 +1,245 @@
+"""PSF profiles as cubic B-splines on an oversampled grid, evaluated for many stars at once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import spline_filter, uniform_filter1d
+
+__all__ = ["Profile", "cutouts", "moffat_samples", "spline_coefficients", "spline_taps"]
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    r"""An effective PSF: the share of a star's flux that falls into a pixel, by offset.
+
+    Parameters
+    ----------
+    coefficients : (G, M, M) ndarray
+        Coefficients of cubic B-splines, M odd, for each of G places on the detector.
+    oversampling : int
+        Grid steps per pixel.
+    x_nodes, y_nodes : (gx,), (gy,) ndarray
+        Columns and rows of the places; G = gy gx, row by row.
+
+    Notes
+    -----
+    With k the oversampling, :math:`c = (M - 1) / 2`, and u, v pixel minus star,
+
+    .. math::
+        \psi(u, v) = \sum_{qp} C_{qp} B_3(k u + c - p) B_3(k v + c - q) .
+
+    All pixels of a star fall onto the same phase of the grid.  For the stars that share the grid
+    cell, the pixels of all of them are therefore one matrix product, of the 16 spline weights of
+    every star with a table of coefficients.
+    """
+
+    coefficients: np.ndarray
+    oversampling: int
+    x_nodes: np.ndarray
+    y_nodes: np.ndarray
+
+    @classmethod
+    def constant(cls, samples, oversampling):
+        """Profile through samples on the grid, the same all over the detector."""
+        zero = np.zeros(1)
+        return cls(spline_coefficients(samples)[None], oversampling, zero, zero)
+
+    @property
+    def radius(self):
+        """Greatest whole number of pixels from the star at which the profile is defined."""
+        return (self.coefficients.shape[-1] - 1) // 2 // self.oversampling
+
+    def samples(self):
+        """Values at the nodes of the grid, (G, M, M)."""
+        c = np.pad(self.coefficients, ((0, 0), (1, 1), (1, 1)))
+        c = (c[:, :-2] + 4 * c[:, 1:-1] + c[:, 2:]) / 6
+        return (c[:, :, :-2] + 4 * c[:, :, 1:-1] + c[:, :, 2:]) / 6
+
+    def node_weights(self, x, y):
+        """Weights (N, G) of the places for stars at x, y: bilinear, constant beyond the rim."""
+        wx, wy = _hat(x, self.x_nodes), _hat(y, self.y_nodes)
+        return (wy[:, :, None] * wx[:, None, :]).reshape(len(x), -1)
+
+    def evaluate(self, dx, dy, half, weights=None, *, gradient=True):
+        """Profile of each star in the pixels of its cut-out.
+
+        Parameters
+        ----------
+        dx, dy : (N,) ndarray
+            Position of the star relative to the central pixel of its cut-out.
+        half : int
+            The cut-outs are 2 half + 1 px wide.
+        weights : (N, G) ndarray, optional
+            Weights of the places, see `node_weights`; may be left out for a constant profile.
+        gradient : bool, optional
+            Whether to return the derivatives by the position too.
+
+        Returns
+        -------
+        (3, N, n) or (1, N, n) ndarray
+            Value and, if asked for, derivatives by x and y, in n = (2 half + 1)^2 pixels.
+        """
+        base_x, taps_x, slopes_x = spline_taps(self._center - self.oversampling * dx)
+        base_y, taps_y, slopes_y = spline_taps(self._center - self.oversampling * dy)
+        outer = [taps_y[:, :, None] * taps_x[:, None, :]]
+        if gradient:
+            outer.append(-self.oversampling * taps_y[:, :, None] * slopes_x[:, None, :])
+            outer.append(-self.oversampling * slopes_y[:, :, None] * taps_x[:, None, :])
+        outer = np.stack(outer).reshape(len(outer), len(dx), 16)
+        result = np.zeros((len(outer), len(dx), (2 * half + 1) ** 2))
+        margin = self.oversampling * (half + 3) + 4
+        padded = np.pad(self.coefficients, ((0, 0), (margin, margin), (margin, margin)))
+        # Stars that ran far away see nothing but the padding.
+        limit = margin - self.oversampling * half - 4
+        lowest, highest = -limit, self.coefficients.shape[-1] + limit
+        base_x, base_y = np.clip(base_x, lowest, highest), np.clip(base_y, lowest, highest)
+        cell = base_y * 10_000 + base_x
+        order = np.argsort(cell, kind="stable")
+        starts = np.flatnonzero(np.diff(cell[order], prepend=cell[order[:1]] - 1))
+        step = self.oversampling * np.arange(-half, half + 1)
+        for rows in np.split(order, starts[1:]) if len(order) else ():
+            iy = base_y[rows[0]] + margin + np.arange(-1, 3)[:, None] + step
+            ix = base_x[rows[0]] + margin + np.arange(-1, 3)[:, None] + step
+            for g, grid in enumerate(padded):
+                if weights is None:
+                    pick, factor = rows, None
+                else:
+                    pick = rows[weights[rows, g] > 0]
+                    factor = weights[pick, g][:, None]
+                if len(pick) == 0:
+                    continue
+                table = grid[iy[:, None, :, None], ix[None, :, None, :]].reshape(16, -1)
+                part = outer[:, pick] if factor is None else outer[:, pick] * factor
+                result[:, pick] += part @ table
+        return result
+
+    @property
+    def _center(self):
+        return (self.coefficients.shape[-1] - 1) // 2
+
+
+def spline_taps(position):
+    """First knot, the four weights and their slopes of cubic B-splines at positions in grid steps.
+
+    Parameters
+    ----------
+    position : (N,) ndarray
+        Positions.
+
+    Returns
+    -------
+    base : (N,) int ndarray
+        Knot below; the weights are those of knots base - 1 to base + 2.
+    weights, slopes : (N, 4) ndarray
+        Values of the splines, and their derivatives by the position.
+    """
+    base = np.floor(position).astype(int)
+    t = position - base
+    weights = np.stack(
+        [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], axis=1
+    )
+    slopes = np.stack(
+        [-3 * (1 - t) ** 2, 9 * t**2 - 12 * t, -9 * t**2 + 6 * t + 3, 3 * t**2], axis=1
+    )
+    return base, weights / 6, slopes / 6
+
+
+def spline_coefficients(samples):
+    """Coefficients of the cubic B-splines through samples (..., M, M); zero outside.
+
+    Parameters
+    ----------
+    samples : (..., M, M) ndarray
+        Values at the nodes.
+
+    Returns
+    -------
+    (..., M, M) ndarray
+        Coefficients.
+    """
+    samples = np.asarray(samples, dtype=float)
+    flat = samples.reshape(-1, *samples.shape[-2:])
+    return np.stack([spline_filter(s, order=3, mode="grid-constant") for s in flat]).reshape(
+        samples.shape
+    )
+
+
+def moffat_samples(shape, half, oversampling):
+    """Sample an elliptical Moffat profile, integrated over pixels, on a grid.
+
+    Parameters
+    ----------
+    shape : (4,) array_like
+        Logarithm of the half width in px, logarithm of beta - 1, and two ellipticities.
+    half : int
+        Half-width of the grid in px.
+    oversampling : int
+        Grid steps per pixel.
+
+    Returns
+    -------
+    (M, M) ndarray
+        Samples, M = 2 half oversampling + 1.
+    """
+    width, beta = np.exp(shape[0]), 1 + np.exp(shape[1])
+    # Points within a pixel: enough for cores well below a pixel.
+    fine = 4
+    n = (half + 1) * oversampling * fine
+    u = np.arange(-n, n + 1) / (oversampling * fine)
+    # An area-preserving stretch.
+    e1, e2 = shape[2], shape[3]
+    norm = 1 / np.sqrt(max(1 - e1**2 - e2**2, 0.05))
+    r2 = norm * ((1 - e1) * u**2 + (1 + e1) * (u**2)[:, None] - 2 * e2 * u[:, None] * u)  # (y, x)
+    values = (1 + r2 * (2 ** (1 / beta) - 1) / width**2) ** -beta
+    box = oversampling * fine
+    for axis in (0, 1):
+        # An even number of points: the mean of both ways to centre the box.
+        values = 0.5 * (
+            uniform_filter1d(values, box, axis=axis)
+            + uniform_filter1d(values, box, axis=axis, origin=-1)
+        )
+    samples = values[oversampling * fine : -oversampling * fine : fine][
+        :, oversampling * fine : -oversampling * fine : fine
+    ]
+    return samples / samples.sum() * oversampling**2
+
+
+def cutouts(image, xc, yc, half):
+    """Cut-outs (N, n) of 2 half + 1 px squares about integer centres, and where they are inside.
+
+    Parameters
+    ----------
+    image : (ny, nx) ndarray
+        Image.
+    xc, yc : (N,) int ndarray
+        Central pixels.
+    half : int
+        Half-width of the squares.
+
+    Returns
+    -------
+    pixels : (N, n) ndarray
+        Values; at the rim those of the outermost pixels are repeated.
+    inside : (N, n) bool ndarray
+        True where the pixel is on the image.
+    """
+    ny, nx = image.shape
+    step = np.arange(-half, half + 1)
+    iy, ix = yc[:, None] + step, xc[:, None] + step
+    inside = ((iy >= 0) & (iy < ny))[:, :, None] & ((ix >= 0) & (ix < nx))[:, None, :]
+    iy, ix = np.clip(iy, 0, ny - 1), np.clip(ix, 0, nx - 1)
+    flat = (len(xc), len(step) ** 2)
+    return image[iy[:, :, None], ix[:, None, :]].reshape(flat), inside.reshape(flat)
+
+
+def _hat(position, nodes):
+    """Weights of linear interpolation between nodes, constant beyond them."""
+    if len(nodes) == 1:
+        return np.ones((len(position), 1))
+    position = np.clip(position, nodes[0], nodes[-1])
+    cell = np.clip(np.searchsorted(nodes, position) - 1, 0, len(nodes) - 2)
+    t = (position - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+    weights = np.zeros((len(position), len(nodes)))
+    rows = np.arange(len(position))
+    weights[rows, cell], weights[rows, cell + 1] = 1 - t, t
+    return weights
