@@ -273,6 +273,17 @@ class TestBadInput:
         with pytest.raises(CatalogError, match="must be an angle, got 'furlongs'"):
             read_catalog(tmp_path / "a.fits")
 
+    @pytest.mark.parametrize("unit", ["degrees", "DEG", "Degree"])
+    def test_units_that_are_nearly_right(self, tmp_path, unit):
+        columns = [
+            fits.Column("ra", "1D", unit=unit, array=[1.0]),
+            fits.Column("dec", "1D", unit=unit, array=[1.0]),
+            fits.Column("pmra", "1D", unit="mas/year", array=[1.0]),
+        ]
+        fits.BinTableHDU.from_columns(columns).writeto(tmp_path / "a.fits")
+        catalog = read_catalog(tmp_path / "a.fits")
+        assert (catalog["ra"][0], catalog["pmra"][0]) == (1.0, 1.0)
+
     def test_text_positions(self):
         with pytest.raises(CatalogError, match="column 'ra' must be numeric, got '12:30:00'"):
             read_catalog(Table({"ra": ["12:30:00"], "dec": ["+1:00:00"]}))

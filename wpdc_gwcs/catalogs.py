@@ -337,7 +337,20 @@ def _read_table(path, format):
 
 
 def split_extension(path):
-    """``path[EXT]`` -> path, EXT; a file whose name really ends in brackets is left alone."""
+    """Split ``path[EXT]``; a file whose name really ends in brackets is left alone.
+
+    Parameters
+    ----------
+    path : path-like
+        What the user gave.
+
+    Returns
+    -------
+    path : `~pathlib.Path`
+        The file.
+    extension : int, str or None
+        Number or name of the extension.
+    """
     text = str(path)
     found = re.fullmatch(r"(.+)\[([^\[\]]+)\]", text)
     if found is None or Path(text).exists():
@@ -503,6 +516,8 @@ def _values(table, column, unit, default, name, rule):
     given = getattr(table[column], "unit", None)
     if given is None or given == u.dimensionless_unscaled:
         given = default
+    if isinstance(given, u.UnrecognizedUnit):
+        given = _forgiven_unit(given)
     if given == unit:
         return values
     try:
@@ -512,6 +527,16 @@ def _values(table, column, unit, default, name, rule):
             f"{name}: unit of column {column!r} must be {rule}, got {str(given)!r}"
         ) from None
     return values * factor
+
+
+def _forgiven_unit(unit):
+    """Read a unit that is not quite in the standard: ``degrees``, ``DEG``, ``mas/year``."""
+    text = re.sub(r"milli-?arc-?sec(ond)?s?", "mas", unit.name.strip().lower())
+    text = re.sub(r"\bdegrees?\b", "deg", re.sub(r"\byears?\b", "yr", text))
+    try:
+        return u.Unit(text)
+    except ValueError:
+        return unit
 
 
 def _add_ellipse_errors(columns, table, names, name):

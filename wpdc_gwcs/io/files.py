@@ -65,7 +65,18 @@ class OutputExistsError(InputError, FileExistsError):
 
 
 def first_line(error):
-    """Give the first line of an error's message, for messages of one line."""
+    """Give the first line of an error's message, for messages of one line.
+
+    Parameters
+    ----------
+    error : Exception
+        The error.
+
+    Returns
+    -------
+    line : str
+        The name of its type if it has no message.
+    """
     return str(error).strip().split("\n")[0] or type(error).__name__
 
 
