@@ -193,6 +193,14 @@ def test_pv_inverse_is_nan_where_there_is_none():
     assert np.all(np.isnan(inverse(np.inf, 0.0)))
 
 
+def test_pv_inverse_of_a_mirror_and_a_swap(rng):
+    """Headers may turn and mirror the plane in the polynomial."""
+    points = rng.uniform(-0.5, 0.5, (2, 50))
+    for linear in ({"pv1_1": -1.0}, {"pv1_1": 0.0, "pv2_1": 0.0, "pv1_2": 1.0, "pv2_2": 1.0}):
+        pv = PVPolynomial(pv1_4=0.05, pv2_7=0.02, **linear)
+        assert_allclose(pv.inverse(*pv(*points)), points, rtol=0, atol=1e-13)
+
+
 # --- look-up table
 
 

@@ -391,7 +391,7 @@ class PlaneMap:
         self.radial = radial
         self.radial_matrix = np.eye(2) if radial_matrix is None else radial_matrix
         self.grid = grid
-        self._start_fit = self._start_range = self._start_spline = None
+        self._start_fit = self._start_range = self._start_spline = self._middle_sign = None
         if polynomial is not None:
             self.derivatives = [(_derivative(c, 0), _derivative(c, 1)) for c in polynomial]
 
@@ -507,8 +507,8 @@ class PlaneMap:
         Iterates stay on the grid: for a point that lies on it the way is only shortened by that,
         and a point that lies outside is left with a residual and becomes NaN.  (They may leave it
         by 1e-6 px, since rounding moves points of the rim; such an answer is put on the rim.)  A
-        point where the Jacobian determinant is not positive (the image is folded over there) is no
-        answer either.
+        point where the Jacobian determinant has another sign than in the middle (the image is
+        folded over there) is no answer either.
         """
         good = np.isfinite(a)
         good &= np.isfinite(b)
@@ -565,7 +565,7 @@ class PlaneMap:
         return np.maximum(fa, fb, out=fa)
 
     def _newton_step(self, a, b, x, y, margin):
-        """Return the next iterate and the Jacobian determinant at the present one."""
+        """Return the next iterate and the determinant at the present one, negative in a fold."""
         (fa, fb), (a_x, a_y, b_x, b_y) = self.jacobian(x, y, margin)
         np.subtract(a, fa, out=fa)
         np.subtract(b, fb, out=fb)
@@ -582,7 +582,20 @@ class PlaneMap:
         a_x /= determinant
         a_x += y
         self._clip(b_y, a_x, margin)
+        if self._orientation() < 0:
+            np.negative(determinant, out=determinant)
         return b_y, a_x, determinant
+
+    def _orientation(self):
+        """Return the sign of the Jacobian determinant in the middle, -1 for a mirror."""
+        if self._middle_sign is None:
+            point = self.origin
+            if self.grid is not None:
+                grid = self.grid
+                point = (0.5 * (grid.x_low + grid.x_high), 0.5 * (grid.y_low + grid.y_high))
+            _, (a_x, a_y, b_x, b_y) = self.jacobian(*(np.array([value]) for value in point))
+            self._middle_sign = -1 if (a_x * b_y - a_y * b_x)[0] < 0 else 1
+        return self._middle_sign
 
     def _start(self, a, b):
         """Return where to start the inversion.
