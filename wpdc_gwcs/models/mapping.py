@@ -12,7 +12,6 @@ float64 blocks; models hand over blocks through `wpdc_gwcs.models.blocks`.
 
 import math
 import threading
-from math import comb
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -39,7 +38,7 @@ _RIM = 1e-6
 def _linear_power(coefficients, power):
     """Coefficients of ``(c0 a + c1 b)**power`` by the power of ``a``, lowest first."""
     c0, c1 = coefficients
-    return np.array([comb(power, i) * c0**i * c1 ** (power - i) for i in range(power + 1)])
+    return np.array([math.comb(power, i) * c0**i * c1 ** (power - i) for i in range(power + 1)])
 
 
 def expand_pv(coefficients, degree, radial, matrix):
@@ -324,7 +323,7 @@ class CellGrid:
             shift = np.zeros((n, m, m))
             for p in range(m):
                 for a in range(p + 1):
-                    shift[:, a, p] = comb(p, a) * edge ** (p - a) * step**a
+                    shift[:, a, p] = math.comb(p, a) * edge ** (p - a) * step**a
             shifts.append(shift)
         local = np.einsum("iap,jbq,kpq->kabji", *shifts, polynomial, optimize=True)
         n = self.rows.shape[1]
@@ -613,8 +612,9 @@ class PlaneMap:
             )
             x, y = x.ravel(), y.ravel()
             images = self(x, y)
-            self._start_fit = PlaneMap(*fit_polynomial(images, (x, y), _FIT_DEGREE))
             self._start_range = [(image.min(), image.max()) for image in images]
+            # Last: other threads take it for the sign that all is there.
+            self._start_fit = PlaneMap(*fit_polynomial(images, (x, y), _FIT_DEGREE))
         if len(a) < _SPLINE_SIZE:
             return self._start_fit(a, b)
         if self._start_spline is None:
