@@ -25,6 +25,7 @@ sources have tables of their own.
 
 import dataclasses
 import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import asdf
@@ -121,7 +122,7 @@ def read_asdf(path):
         file.seek(max(0, Path(path).stat().st_size - 4096))
         if not file.read().rstrip(b"\0\r\n ").endswith(b"..."):
             raise FileFormatError(f"{path}: truncated ASDF file: must end with '...', does not")
-    tree = _read_tree(path).get("wpdc")
+    tree = _read_entry(path, "wpdc")
     if not isinstance(tree, dict):
         raise FileFormatError(f"{path}: must have a 'wpdc' tree, has none: not a wpdc_gwcs file")
     _check_version(tree, path)
@@ -157,7 +158,7 @@ def read_asdf_wcs(path):
     FileFormatError
         If the file is damaged or has no ``wcs``.
     """
-    wcs = _read_tree(path).get("wcs")
+    wcs = _read_entry(path, "wcs")
     if not hasattr(wcs, "pixel_to_world_values"):
         raise FileFormatError(f"{path}: must have a 'wcs' that gwcs can open, has none")
     return wcs
@@ -170,16 +171,26 @@ def _write_tree(tree, path, overwrite, compression=None):
         asdf.AsdfFile(tree).write_to(temporary, all_array_compression=compression)
 
 
-def _read_tree(path):
+def _read_entry(path, key):
+    """Read one entry of the tree and leave the others alone, which may be of newer libraries."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with asdf.open(path, lazy_load=False, memmap=False) as file:
-                return dict(file.tree)
+            with asdf.open(path, lazy_load=False, memmap=False, lazy_tree=True) as file:
+                return _loaded(file.tree.get(key))
     except (asdf.exceptions.ValidationError, *READ_ERRORS) as problem:
         raise FileFormatError(
             f"{path}: damaged or truncated ASDF file: {first_line(problem)}"
         ) from problem
+
+
+def _loaded(node):
+    """Turn the lazy nodes of a file that is still open into plain values."""
+    if isinstance(node, Mapping):
+        return {key: _loaded(value) for key, value in node.items()}
+    if isinstance(node, Sequence) and not isinstance(node, str):
+        return [_loaded(value) for value in node]
+    return np.array(node) if isinstance(node, asdf.tags.core.NDArrayType) else node
 
 
 def _check_version(tree, path):
