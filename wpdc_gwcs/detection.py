@@ -295,8 +295,8 @@ def _window(x, y, xc, yc, half, sigma):
     return dx, dy, weight * np.exp(-0.5 * (dx / sigma) ** 2)[:, None, :]
 
 
-def _moments(pixels, dx, dy, weight, sigma):
-    """Second moments (xx, yy, xy) under a window, corrected for it as for Gaussian profiles."""
+def _sizes(pixels, dx, dy, weight, sigma):
+    """Measure standard deviations along both axes, as for Gaussians under the window."""
     weighted = pixels * weight
     total = weighted.sum((1, 2))
     rows, columns = weighted.sum(2), weighted.sum(1)
@@ -305,13 +305,12 @@ def _moments(pixels, dx, dy, weight, sigma):
         xx = (columns * dx**2).sum(1) / total - mx**2
         yy = (rows * dy**2).sum(1) / total - my**2
         xy = np.einsum("sj,sji,si->s", dy, weighted, dx) / total - mx * my
-        # The inverse matrices subtract: 1/measured = 1/profile + 1/window.
-        determinant = xx * yy - xy**2
-        a, b, c = yy / determinant - sigma**-2, xx / determinant - sigma**-2, -xy / determinant
-        inverse = a * b - c**2
-        valid = (total > 0) & (determinant > 0) & (a > 0) & (b > 0) & (inverse > 0)
-        moments = np.stack([b / inverse, a / inverse, -c / inverse])
-    return np.where(valid, moments, np.nan)
+        measured = 0.5 * (xx + yy) + np.multiply.outer([1, -1], np.hypot(0.5 * (xx - yy), xy))
+        # Inverse variances subtract: 1/measured = 1/profile + 1/window.
+        variance = np.where(measured > 0, measured * sigma**2 / (sigma**2 - measured), 0.0)
+    variance[measured >= sigma**2] = np.inf
+    variance[:, ~(total > 0)] = np.nan
+    return np.sqrt(variance)
 
 
 def _typical_fwhm(background, found):
@@ -326,14 +325,14 @@ def _typical_fwhm(background, found):
         sigma = fwhm * _SIGMA_PER_FWHM
         half = int(np.ceil(3 * sigma)) + 1
         pixels = _cutouts(background.image, xc, yc, half)
-        xx, yy, _xy = _moments(pixels, *_window(x, y, xc, yc, half, sigma), sigma)
-        size = np.sqrt(0.5 * (xx + yy))
-        size = size[np.isfinite(size)]
+        major, minor = _sizes(pixels, *_window(x, y, xc, yc, half, sigma), sigma)
+        size = np.hypot(major, minor) / np.sqrt(2)
+        size = size[np.isfinite(size) & (size > 0)]
         # Undetermined (all noise, or broader than any window): stay with the isophotal size.
         if size.size == 0:
             fwhm = 2.35 * float(np.median(np.sqrt(found["a"][rows] * found["b"][rows])))
             break
-        fwhm = float(np.clip(np.median(size) / _SIGMA_PER_FWHM, 0.75 * fwhm, 2 * fwhm))
+        fwhm = float(np.clip(_mode(size)[0] / _SIGMA_PER_FWHM, 0.75 * fwhm, 2 * fwhm))
     return float(np.clip(fwhm, 1.0, 0.1 * min(background.image.shape)))
 
 
@@ -354,6 +353,7 @@ def _measure(background, found, fwhm, gain, saturation):
     flags = shapes.pop("flags")
     minor, size = shapes.pop("minor"), shapes["fwhm"]
     flags |= _unlike_stars(minor, size, shapes["snr"], flags)
+    shapes["fwhm"] = np.where(np.isfinite(size), size, np.nan)
     flags |= np.where(_blended(x, y, flux, fwhm), FLAG_BLENDED, 0)
     return Table(
         {"x": x, "y": y}
@@ -415,15 +415,14 @@ def _shapes(background, x, y, xpeak, ypeak, fwhm, gain, saturation):
         x_err = 2 * np.sqrt((noise.sum(1) * dx**2).sum(1)) / signal
         y_err = 2 * np.sqrt((noise.sum(2) * dy**2).sum(1)) / signal
     positive = signal > 0
-    xx, yy, xy = _moments(pixels, dx, dy, weight, sigma)
-    minor = np.sqrt(np.maximum(0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy), 0))
+    major, minor = _sizes(pixels, dx, dy, weight, sigma)
     roundness, sharpness = _daofind_shape(image, xpeak, ypeak, sigma)
     return {
         "x_err": np.where(positive, x_err, np.nan),
         "y_err": np.where(positive, y_err, np.nan),
         "snr": np.where(positive, snr, 0.0),
         "peak": np.where(core, pixels, -np.inf).max((1, 2)).astype(float),
-        "fwhm": np.sqrt(0.5 * (xx + yy)) / _SIGMA_PER_FWHM,
+        "fwhm": np.hypot(major, minor) / np.sqrt(2) / _SIGMA_PER_FWHM,
         "roundness": roundness,
         "sharpness": sharpness,
         "minor": minor / _SIGMA_PER_FWHM,
@@ -462,23 +461,40 @@ def _daofind_shape(image, xpeak, ypeak, sigma):
 
 def _unlike_stars(minor, size, snr, flags):
     """Flag what is clearly sharper or broader than the stars of this image."""
-    # The stars' locus, from the bright sources; 1.4826 MAD is robust to the rest.
+    result = np.zeros(len(size), int)
     bright = (flags == 0) & (snr > 30) & np.isfinite(size)
     if bright.sum() < 10:
         bright = (flags == 0) & np.isfinite(size)
     if bright.sum() < 10:
-        return np.zeros(len(size), int)
-    sizes, minors = np.median(size[bright]), np.median(minor[bright])
-    size_scatter = 1.4826 * np.median(np.abs(size[bright] - sizes))
-    minor_scatter = 1.4826 * np.median(np.abs(minor[bright] - minors))
+        return result
+    typical_size, size_scatter = _mode(size[bright])
+    typical_minor, minor_scatter = _mode(minor[bright])
     # Relative error of a size from noise alone is about 1.4 / SNR under a matched window.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        noise = 3 * 1.4 / np.maximum(snr, 1e-3)
-    sharp = minor < np.minimum(minors * (0.75 - noise), minors - 3 * minor_scatter)
-    # No second moment beyond the window's: flat or growing outwards.
-    broad = size > np.maximum(sizes * (1.25 + noise), sizes + 4 * size_scatter)
-    broad |= ~np.isfinite(size) & (snr > 20)
-    return np.where(sharp, FLAG_COSMIC, 0) | np.where(broad & ~sharp, FLAG_EXTENDED, 0)
+    noise = 3 * 1.4 / np.maximum(snr, 1e-3)
+    with np.errstate(invalid="ignore"):
+        sharp = minor < typical_minor - np.maximum(
+            (0.25 + noise) * typical_minor, 5 * minor_scatter
+        )
+        broad = size > typical_size + np.maximum((0.2 + noise) * typical_size, 5 * size_scatter)
+    result[broad] = FLAG_EXTENDED
+    result[sharp] = FLAG_COSMIC
+    return result
+
+
+def _mode(values):
+    """Most crowded value and its scatter: centre and width of the shortest third of the values.
+
+    Cosmic rays and galaxies can be more than half of the bright sources; the stars are those that
+    are alike.
+    """
+    values = np.sort(values)
+    n = max(2, int(np.ceil(len(values) / 3)))
+    if len(values) <= n:
+        return float(np.median(values)), 0.0
+    width = values[n - 1 :] - values[: len(values) - n + 1]
+    first = int(np.argmin(width))
+    # A third of a normal distribution lies within 0.43 standard deviations.
+    return float(np.median(values[first : first + n])), float(width[first] / 0.86)
 
 
 def _blended(x, y, flux, fwhm):

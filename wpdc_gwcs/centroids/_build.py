@@ -3,13 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from scipy.linalg import LinAlgError, solveh_banded
 from scipy.spatial import KDTree
 
-from wpdc_gwcs.centroids._fit import estimate_noise, fit_stars
+from wpdc_gwcs.centroids._fit import estimate_noise, fit_stars, star_like
 from wpdc_gwcs.centroids._profile import (
     Profile,
-    cutouts,
     moffat_samples,
     spline_coefficients,
     spline_taps,
@@ -26,17 +26,22 @@ _SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 _ROUGHNESS = 0.15
 _DEVIATION = 0.3
 
+# Places along each axis at which a varying profile is tabulated.
+_N_NODES = 5
+
 # Pixels further off the model than this many sigma weigh as if they were there.
 _HUBER = 3.0
 
 
-def select_stars(x, y, flux, snr, quality, fwhm, shape, *, n_max, min_snr):
+def select_stars(stars, snr, quality, fwhm, shape, *, n_max, min_snr):
     """Choose bright, isolated stars that are spread over the frame.
 
     Parameters
     ----------
-    x, y, flux, snr : (N,) ndarray
+    stars : Stars
         All sources.
+    snr : (N,) ndarray
+        Their signal-to-noise ratios.
     quality : (N,) bool ndarray
         True for those that are single, clean stars.
     fwhm : float
@@ -53,6 +58,7 @@ def select_stars(x, y, flux, snr, quality, fwhm, shape, *, n_max, min_snr):
     (n,) int ndarray
         Rows, the brightest first.
     """
+    x, y, flux = stars
     candidate = quality & (snr >= min_snr) & (flux > 0)
     pairs = KDTree(np.column_stack([x, y])).query_pairs(4 * fwhm, output_type="ndarray")
     if len(pairs):
@@ -75,14 +81,14 @@ def select_stars(x, y, flux, snr, quality, fwhm, shape, *, n_max, min_snr):
     return rows[np.sort(np.argsort(rank, kind="stable")[:n_max])]
 
 
-def fit_moffat(image, rms, mask, noise, stars, fwhm, *, half, radius):
+def fit_moffat(field, noise, stars, fwhm, *, half, radius):
     """Fit one elliptical, pixel-integrated Moffat profile to stars.
 
     Parameters
     ----------
-    image, rms, mask, noise
+    field, noise
         As for `fit_stars`.
-    stars : (x, y, flux) tuple of (N,) ndarray
+    stars : Stars
         Start values.
     fwhm : float
         FWHM in px to start from.
@@ -93,10 +99,8 @@ def fit_moffat(image, rms, mask, noise, stars, fwhm, *, half, radius):
 
     Returns
     -------
-    shape : (4,) ndarray
+    (4,) ndarray
         Parameters, see `moffat_samples`.
-    stars : tuple of (N,) ndarray
-        Positions and fluxes.
 
     Notes
     -----
@@ -105,176 +109,205 @@ def fit_moffat(image, rms, mask, noise, stars, fwhm, *, half, radius):
     any function of the phase go with a profile that fits as well.
     """
     shape = np.array([np.log(max(0.5 * np.sqrt(max(fwhm**2 - 0.7, 0.3)), 0.3)), np.log(2.0), 0, 0])
-    steps = np.array([0.02, 0.05, 0.01, 0.01])
+    lowest = [np.log(0.2), np.log(0.3), -0.6, -0.6]
+    highest = [np.log(2 * fwhm), np.log(30.0), 0.6, 0.6]
+    steps = np.diag([0.02, 0.05, 0.01, 0.01])
 
     def profile_of(parameters):
         return Profile.constant(moffat_samples(parameters, half, OVERSAMPLING), OVERSAMPLING)
 
-    x, y, flux = stars
-    size = int(np.ceil(radius))
-    damping = 1e-3
     for _ in range(8):
         profile = profile_of(shape)
-        fits = fit_stars(image, rms, mask, profile, noise, x, y, flux, radius=radius)
-        good = fits.valid & (fits.chi2 < 3 * np.median(fits.chi2))
+        fits = fit_stars(field, profile, noise, stars, radius=radius)
+        good = star_like(fits.stars.flux, fits.chi2, fits.valid)
         if good.sum() < 3:
             break
-        x, y, flux = (
-            np.where(fits.valid, new, old)
-            for new, old in zip((fits.x, fits.y, fits.flux), (x, y, flux))
-        )
-        xs, ys, fs = x[good], y[good], flux[good, None]
-        xc, yc = np.rint(xs).astype(int), np.rint(ys).astype(int)
-        pixels, use = cutouts(image, xc, yc, size)
-        if mask is not None:
-            use &= ~cutouts(mask, xc, yc, size)[0]
-        step = np.arange(-size, size + 1)
-        use &= (np.hypot(step[:, None], step) <= radius).ravel()
-        basis = profile.evaluate(xs - xc, ys - yc, size)
-        model = fs * basis[0]
-        weight = use / noise.variance(cutouts(rms, xc, yc, size)[0].astype(float) ** 2, model)
-        residual = pixels - model
-        scale = np.sqrt(weight)
-        weight = weight * np.minimum(1, _HUBER / np.maximum(np.abs(residual) * scale, 1e-9))
+        stars = fits.stars.take(good)
         slopes = [
-            fs
-            * (profile_of(shape + d).evaluate(xs - xc, ys - yc, size, gradient=False)[0] - basis[0])
-            / d.sum()
-            for d in np.diag(steps)
+            (profile_of(shape + d).coefficients - profile.coefficients) / d.sum() for d in steps
         ]
-        own = np.stack([fs * basis[1], fs * basis[2], basis[0]], axis=1)
-        common = np.stack(slopes, axis=1)
-        # Positions and fluxes are eliminated star by star.
-        nn = (own * weight[:, None]) @ own.transpose(0, 2, 1)
-        nc = (own * weight[:, None]) @ common.transpose(0, 2, 1)
-        cc = (common * weight[:, None]) @ common.transpose(0, 2, 1)
-        rn = (own * weight[:, None]) @ residual[:, :, None]
-        rc = (common * weight[:, None]) @ residual[:, :, None]
-        solved = np.linalg.pinv(nn) @ np.concatenate([nc, rn], axis=2)
-        left = (cc - nc.transpose(0, 2, 1) @ solved[:, :, :4]).sum(axis=0)
-        right = (rc - nc.transpose(0, 2, 1) @ solved[:, :, 4:]).sum(axis=0)[:, 0]
-        left[np.diag_indices(4)] *= 1 + damping
-        change = np.clip(np.linalg.lstsq(left, right, rcond=None)[0], -0.3, 0.3)
-        shape = shape + change
-        shape = np.clip(
-            shape,
-            [np.log(0.2), np.log(0.3), -0.6, -0.6],
-            [np.log(fwhm * 2), np.log(30.0), 0.6, 0.6],
-        )
+        left, right = _reduced_normal(field, profile, noise, stars, slopes, radius)
+        left = left.sum(axis=0)
+        left[np.diag_indices(4)] *= 1.001
+        change = np.linalg.lstsq(left, right.sum(axis=0), rcond=None)[0]
+        shape = np.clip(shape + np.clip(change, -0.3, 0.3), lowest, highest)
         if np.abs(change).max() < 3e-3:
             break
-    return shape, (x, y, flux)
+    return shape
 
 
-def learn_profile(image, rms, mask, noise, stars, base, *, fwhm, radius, gain, iterations=4):
+def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations):
     """Refine a profile and the positions of its stars in turn.
 
     Parameters
     ----------
-    image, rms, mask, noise
+    field, noise
         As for `fit_stars`.
-    stars : (x, y, flux) tuple of (N,) ndarray
+    stars : Stars
         Start values.
-    base : (M, M) ndarray
-        Samples of the profile to start from.
+    start : Profile
+        Profile to start from, constant or varying; what is learnt is the difference from it,
+        the same all over the detector.
     fwhm : float
         FWHM in px.
     radius : float
         Radius in px of the pixels that positions are fitted on.
     gain : float or None
         Electrons per count.
-    iterations : int, optional
+    iterations : int
         Number of rounds.
 
     Returns
     -------
     profile : Profile
         Profile, normalised and centred.
-    stars : tuple of (n,) ndarray
-        Positions and fluxes of the stars kept.
-    kept : (n,) int ndarray
-        Their rows.
+    stars : Stars
+        Stars kept.
     noise : Noise
         Noise with the profile's own error.
     """
-    x, y, flux = stars
-    kept = np.arange(len(x))
-    profile = Profile.constant(base, OVERSAMPLING)
-    start = profile
+    profile = start
     for _ in range(iterations):
-        fits = fit_stars(image, rms, mask, profile, noise, x, y, flux, radius=radius)
-        good = fits.valid
-        if good.sum() >= 8:
-            good = good & (fits.chi2 < 4 * np.median(fits.chi2[good]))
-        x, y, flux, kept = (v[good] for v in (fits.x, fits.y, fits.flux, kept))
-        if len(x) == 0:
+        fits = fit_stars(field, profile, noise, stars, radius=radius)
+        stars = fits.stars.take(star_like(fits.stars.flux, fits.chi2, fits.valid))
+        if len(stars.x) == 0:
             break
-        noise = estimate_noise(
-            image, rms, mask, profile, noise, x, y, flux, radius=radius, gain=gain
-        )
-        # Floor: a profile is never known better, and the brightest stars must not rule alone.
+        noise = estimate_noise(field, profile, noise, stars, radius=radius, gain=gain)
+        # A profile is never known better, and the brightest stars must not rule alone.
         noise = replace(noise, mismatch=float(np.clip(noise.mismatch, 0.005, 0.3)))
-        change = _residual_coefficients(image, rms, mask, noise, start, (x, y, flux), fwhm)
-        profile, shift = _centered(start.coefficients[0] + change, fwhm)
-        x, y = x + shift[0], y + shift[1]
-    return profile, (x, y, flux), kept, noise
+        change = _residual_coefficients(field, noise, start, stars, fwhm)
+        profile = _centered(replace(start, coefficients=start.coefficients + change), fwhm)
+    fits = fit_stars(field, profile, noise, stars, radius=radius)
+    return profile, fits.stars.take(fits.valid), noise
 
 
-def vary_profile(image, rms, mask, noise, stars, profile, fwhm, shape, n_nodes):
-    """Let a profile vary over the detector.
+def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
+    r"""Let the width and the shape of a profile vary smoothly over the detector.
 
     Parameters
     ----------
-    image, rms, mask, noise
+    field, noise
         As for `fit_stars`.
-    stars : (x, y, flux) tuple of (N,) ndarray
+    stars : Stars
         Stars fitted with the constant profile.
     profile : Profile
         Constant profile.
     fwhm : float
         FWHM in px.
-    shape : (int, int)
-        Shape of the image.
-    n_nodes : int
-        Number of places along each axis.
+    radius : float
+        Radius in px of the pixels used.
+    degree : int
+        Degree of the polynomials in position.
 
     Returns
     -------
     Profile
-        Profile with n_nodes x n_nodes places; each has learnt from the stars nearest to it.
+        Profile with places all over the detector.
+
+    Notes
+    -----
+    A little more or less blur changes a profile by its second derivatives, and by its fourth in
+    the next order:
+
+    .. math::
+        \psi(u, v; X, Y) = \psi + a_1 \psi_{uu} + a_2 \psi_{uv} + a_3 \psi_{vv}
+                            + a_4 \nabla^4 \psi
+
+    with polynomials :math:`a_k(X, Y)`.  None of these has a first moment: the meaning of the
+    position stays the same all over the detector.
     """
-    x, y, _flux = stars
-    x_nodes = np.linspace(0.5 / n_nodes, 1 - 0.5 / n_nodes, n_nodes) * (shape[1] - 1)
-    y_nodes = np.linspace(0.5 / n_nodes, 1 - 0.5 / n_nodes, n_nodes) * (shape[0] - 1)
-    reach_x, reach_y = shape[1] / n_nodes, shape[0] / n_nodes
-    grids = []
-    for y0 in y_nodes:
-        for x0 in x_nodes:
-            share = np.exp(-0.5 * (((x - x0) / reach_x) ** 2 + ((y - y0) / reach_y) ** 2) * 2.5)
-            rows = share > 0.05
-            near = tuple(column[rows] for column in stars)
-            change = _residual_coefficients(
-                image, rms, mask, noise, profile, near, fwhm, share=share[rows], prior=0.5
-            )
-            grids.append(_centered(profile.coefficients[0] + change, fwhm)[0].coefficients[0])
-    return Profile(np.stack(grids), profile.oversampling, x_nodes, y_nodes)
+    modes = _blur_modes(profile.coefficients[0], fwhm * profile.oversampling)
+    left, right = _reduced_normal(field, profile, noise, stars, modes, radius)
+    ny, nx = field.image.shape
+    terms = _polynomial_terms(stars.x / nx, stars.y / ny, degree)
+    k, p = len(modes), terms.shape[1]
+    normal = np.einsum("sij,sp,sq->ipjq", left, terms, terms).reshape(k * p, k * p)
+    vector = np.einsum("si,sp->ip", right, terms).reshape(k * p)
+    # Amplitudes of order one would be a different star: a mild prior for empty regions.
+    normal[np.diag_indices(k * p)] += 10.0
+    amplitudes = np.linalg.solve(normal, vector).reshape(k, p)
+    nodes = np.linspace(0, 1, _N_NODES)
+    x, y = (v.ravel() for v in np.meshgrid(nodes, nodes))
+    local = _polynomial_terms(x, y, degree) @ amplitudes.T
+    grids = profile.coefficients + np.einsum("gk,kji->gji", local, np.stack(modes))
+    varying = Profile(grids, profile.oversampling, nodes * (nx - 1), nodes * (ny - 1))
+    return _centered(varying, fwhm)
 
 
-def _residual_coefficients(image, rms, mask, noise, profile, stars, fwhm, *, share=None, prior=1.0):
+def _polynomial_terms(x, y, degree):
+    """Legendre products up to a total degree, of positions in units of the detector's sides."""
+    tx, ty = legvander(2 * x - 1, degree), legvander(2 * y - 1, degree)
+    return np.stack(
+        [tx[:, i] * ty[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1
+    )
+
+
+def _blur_modes(coefficients, scale):
+    """Coefficients of the second derivatives and of the squared Laplacian, in units of scale."""
+
+    def along(c, axis):
+        padded = np.pad(c, [(1, 1) if a == axis else (0, 0) for a in (0, 1)])
+        low, high = (np.take(padded, np.arange(n, n + c.shape[axis]), axis) for n in (0, 2))
+        return low, high
+
+    def second(c, axis):
+        low, high = along(c, axis)
+        return (low - 2 * c + high) * scale**2
+
+    def first(c, axis):
+        low, high = along(c, axis)
+        return 0.5 * (high - low) * scale
+
+    xx, yy = second(coefficients, 1), second(coefficients, 0)
+    laplacian = xx + yy
+    return [
+        xx / 8,
+        first(first(coefficients, 0), 1) / 4,
+        yy / 8,
+        (second(laplacian, 0) + second(laplacian, 1)) / 128,
+    ]
+
+
+def _reduced_normal(field, profile, noise, stars, modes, radius):
+    """Set up normal equations (N, K, K), (N, K) for modes, free of position and flux."""
+    half = int(np.ceil(radius))
+    xc, yc, pixels, use, sky = field.cut(stars, half, radius)
+    weights = profile.node_weights(stars.x, stars.y)
+    basis = profile.evaluate(stars.x - xc, stars.y - yc, half, weights)
+    flux = stars.flux[:, None]
+    model = flux * basis[0]
+    residual = pixels - model
+    weight = use / noise.variance(sky, model)
+    weight *= np.minimum(1, _HUBER / np.maximum(np.abs(residual) * np.sqrt(weight), 1e-9))
+    zero = np.zeros(1)
+    common = [
+        flux
+        * Profile(mode.reshape(1, *mode.shape[-2:]), profile.oversampling, zero, zero).evaluate(
+            stars.x - xc, stars.y - yc, half, gradient=False
+        )[0]
+        for mode in modes
+    ]
+    own = np.stack([flux * basis[1], flux * basis[2], basis[0]], axis=1)
+    common = np.stack(common, axis=1)
+    both = np.concatenate([own, common, residual[:, None]], axis=1)
+    normal = (both[:, :-1] * weight[:, None]) @ both.transpose(0, 2, 1)
+    # Positions and fluxes are eliminated star by star.
+    solved = np.linalg.pinv(normal[:, :3, :3]) @ normal[:, :3, 3:]
+    reduced = normal[:, 3:, 3:] - normal[:, 3:, :3] @ solved
+    return reduced[:, :, :-1], reduced[:, :, -1]
+
+
+def _residual_coefficients(field, noise, profile, stars, fwhm):
     """Spline coefficients that take up what a profile leaves: penalised least squares."""
-    x, y, flux = stars
     over, size = profile.oversampling, profile.coefficients.shape[-1]
     half = profile.radius - 1
-    xc, yc = np.rint(x).astype(int), np.rint(y).astype(int)
-    pixels, use = cutouts(image, xc, yc, half)
-    if mask is not None:
-        use &= ~cutouts(mask, xc, yc, half)[0]
-    model = flux[:, None] * profile.evaluate(x - xc, y - yc, half, gradient=False)[0]
+    xc, yc, pixels, use, sky = field.cut(stars, half, np.inf)
+    x, y, flux = stars
+    weights = profile.node_weights(x, y)
+    model = flux[:, None] * profile.evaluate(x - xc, y - yc, half, weights, gradient=False)[0]
     residual = pixels - model
-    weight = use / noise.variance(cutouts(rms, xc, yc, half)[0].astype(float) ** 2, model)
+    weight = use / noise.variance(sky, model)
     weight *= np.minimum(1, _HUBER / np.maximum(np.abs(residual) * np.sqrt(weight), 1e-9)) ** 2
-    if share is not None:
-        weight *= share[:, None]
     weight *= flux[:, None] ** 2
     residual = residual / flux[:, None]
     center = (size - 1) // 2
@@ -299,7 +332,7 @@ def _residual_coefficients(image, rms, mask, noise, profile, stars, fwhm, *, sha
         lower = offset >= 0
         column = np.broadcast_to(index[:, None, :], offset.shape)
         np.add.at(band, (offset[lower], column[lower]), normal[lower])
-    _add_prior(band, np.abs(profile.samples()[0]), fwhm, over, prior)
+    _add_prior(band, profile.samples().mean(axis=0), fwhm, over)
     try:
         solution = solveh_banded(band, right, lower=True, overwrite_ab=True, check_finite=False)
     except LinAlgError:
@@ -307,7 +340,7 @@ def _residual_coefficients(image, rms, mask, noise, profile, stars, fwhm, *, sha
     return solution.reshape(size, size)
 
 
-def _add_prior(band, samples, fwhm, over, prior):
+def _add_prior(band, samples, fwhm, over):
     """Add the expectation that a difference is small and smooth to banded normal equations."""
     size = samples.shape[0]
     center = (size - 1) // 2
@@ -315,8 +348,8 @@ def _add_prior(band, samples, fwhm, over, prior):
     # A smooth envelope of the profile, with wings that stay open for spikes and haloes.
     envelope = samples.max() * (1 + (2 * radius / fwhm) ** 2 * (2**0.5 - 1)) ** -2
     sigma = fwhm * _SIGMA_PER_FWHM * over  # grid steps
-    rough = (prior * _ROUGHNESS * 3 * sigma**-4 * envelope) ** -2
-    own = (prior * _DEVIATION * envelope) ** -2
+    rough = (_ROUGHNESS * 3 * sigma**-4 * envelope) ** -2
+    own = (_DEVIATION * envelope) ** -2
     # Nothing is known about the rim: the profile there is the start's.
     rim = np.abs(np.arange(size) - center) > center - over
     own[rim] *= 1e8
@@ -335,35 +368,36 @@ def _add_prior(band, samples, fwhm, over, prior):
                 band[stride * (i - j), first + stride * j] += difference[i] * difference[j] * weight
 
 
-def _centered(coefficients, fwhm):
-    """Profile with unit sum and its windowed centroid at the origin; also the shift (x, y)."""
-    size, over = coefficients.shape[0], OVERSAMPLING
+def _centered(profile, fwhm):
+    """Profile with unit sums and windowed centroids at the origin."""
+    over = profile.oversampling
+    size = profile.coefficients.shape[-1]
     u = (np.arange(size) - (size - 1) // 2) / over
     sigma = fwhm * _SIGMA_PER_FWHM
-    shift = np.zeros(2)
-    profile = Profile(coefficients[None], over, np.zeros(1), np.zeros(1))
-    samples = profile.samples()[0]
-    for _ in range(10):
-        wx = np.exp(-0.5 * ((u - shift[0]) / sigma) ** 2)
-        wy = np.exp(-0.5 * ((u - shift[1]) / sigma) ** 2)
-        weighted = samples * wy[:, None] * wx
-        total = weighted.sum()
-        step = np.array(
-            [(weighted.sum(0) * (u - shift[0])).sum(), (weighted.sum(1) * (u - shift[1])).sum()]
-        )
-        shift = shift + np.clip(2 * step / total, -0.2, 0.2)
-        if np.abs(step / total).max() < 1e-6:
-            break
-    # Samples of the profile moved by -shift, through its own splines.
-    matrices = []
-    for s in shift:
-        base, taps, _ = spline_taps(np.arange(size) + over * s)
-        matrix = np.zeros((size, size + 20))
-        for a in range(4):
-            column = np.clip(base - 1 + a + 10, 0, size + 19)
-            np.add.at(matrix, (np.arange(size), column), taps[:, a])
-        matrices.append(matrix[:, 10:-10])
-    moved = matrices[1] @ coefficients @ matrices[0].T
-    moved *= over**2 / moved.sum()
-    zero = np.zeros(1)
-    return Profile(spline_coefficients(moved)[None], over, zero, zero), shift
+    moved = []
+    for coefficients, samples in zip(profile.coefficients, profile.samples()):
+        shift = np.zeros(2)
+        for _ in range(20):
+            wx = np.exp(-0.5 * ((u - shift[0]) / sigma) ** 2)
+            wy = np.exp(-0.5 * ((u - shift[1]) / sigma) ** 2)
+            weighted = samples * wy[:, None] * wx
+            moments = [weighted.sum(0) @ (u - shift[0]), weighted.sum(1) @ (u - shift[1])]
+            step = np.clip(2 * np.array(moments) / weighted.sum(), -0.2, 0.2)
+            shift += step
+            if np.abs(step).max() < 1e-7:
+                break
+        matrix_x, matrix_y = (_shift_matrix(size, over * s) for s in shift)
+        grid = matrix_y @ coefficients @ matrix_x.T
+        moved.append(grid * over**2 / grid.sum())
+    return replace(profile, coefficients=spline_coefficients(np.stack(moved)))
+
+
+def _shift_matrix(size, shift):
+    """Matrix from spline coefficients to values on the grid moved by a shift in grid steps."""
+    base, taps, _ = spline_taps(np.arange(size) + shift)
+    column = base[:, None] + np.arange(-1, 3)
+    inside = (column >= 0) & (column < size)
+    matrix = np.zeros((size, size))
+    row = np.broadcast_to(np.arange(size)[:, None], column.shape)
+    matrix[row[inside], column[inside]] = taps[inside]
+    return matrix

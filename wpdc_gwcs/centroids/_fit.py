@@ -1,13 +1,24 @@
 """Weighted least squares for the position and flux of many stars at once."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.ndimage import percentile_filter
+from scipy.optimize import least_squares
 
 from wpdc_gwcs.centroids._profile import cutouts
 
-__all__ = ["Noise", "StarFits", "estimate_noise", "fit_stars", "render"]
+__all__ = [
+    "Field",
+    "Noise",
+    "StarFits",
+    "Stars",
+    "estimate_noise",
+    "fit_stars",
+    "render",
+    "star_like",
+]
 
 # Stars fitted at a time: bounds the memory for their pixels.
 _CHUNK = 4000
@@ -15,9 +26,6 @@ _CHUNK = 4000
 _MAX_STEP = 0.5  # px per iteration
 _MAX_ITERATIONS = 12
 _CONVERGED = 3e-5  # px
-
-# Least reduced chi2 per pixel that counts as an outlier when the noise is estimated.
-_CLIP = 5.0
 
 
 @dataclass(frozen=True)
@@ -46,13 +54,74 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
+class Field:
+    """Pixels to fit.
+
+    Parameters
+    ----------
+    image, rms : (ny, nx) ndarray
+        Image without background, and the noise of the background.
+    mask : (ny, nx) bool ndarray or None
+        True where a pixel must not be used.
+    """
+
+    image: np.ndarray
+    rms: np.ndarray
+    mask: np.ndarray | None
+
+    def cut(self, stars, half, radius):
+        """Cut out the surroundings of stars.
+
+        Parameters
+        ----------
+        stars : Stars
+            N stars.
+        half : int
+            The cut-outs are 2 half + 1 px wide.
+        radius : float
+            Radius in px of the pixels to use.
+
+        Returns
+        -------
+        xc, yc : (N,) int ndarray
+            Central pixels.
+        pixels : (N, n) ndarray
+            Values.
+        use : (N, n) bool ndarray
+            True where a pixel is on the image, good and within the radius.
+        sky : (N, n) ndarray
+            Variance of the background.
+        """
+        xc, yc = np.rint(stars.x).astype(int), np.rint(stars.y).astype(int)
+        pixels, use = cutouts(self.image, xc, yc, half)
+        step = np.arange(-half, half + 1)
+        use &= (np.hypot(step[:, None], step) <= radius).ravel()
+        if self.mask is not None:
+            use &= ~cutouts(self.mask, xc, yc, half)[0]
+        sky = cutouts(self.rms, xc, yc, half)[0].astype(float) ** 2
+        return xc, yc, pixels.astype(float), use, sky
+
+
+class Stars(NamedTuple):
+    """Positions in px and fluxes in counts, (N,) ndarrays."""
+
+    x: np.ndarray
+    y: np.ndarray
+    flux: np.ndarray
+
+    def take(self, rows):
+        """Stars of the given rows."""
+        return Stars(*(column[rows] for column in self))
+
+
+@dataclass(frozen=True, eq=False)
 class StarFits:
     """Result of `fit_stars`: one entry per star.
 
     Parameters
     ----------
-    x, y, flux : (N,) ndarray
-        Position in px and flux in counts.
+    stars : Stars
+        Positions and fluxes.
     covariance : (N, 3, 3) ndarray
         Of x, y and flux; NaN where the fit failed.
     chi2 : (N,) ndarray
@@ -61,32 +130,28 @@ class StarFits:
         True where the fit converged.
     """
 
-    x: np.ndarray
-    y: np.ndarray
-    flux: np.ndarray
+    stars: Stars
     covariance: np.ndarray
     chi2: np.ndarray
     valid: np.ndarray
 
 
-def fit_stars(image, rms, mask, profile, noise, x, y, flux, *, radius, own=None):
+def fit_stars(field, profile, noise, stars, *, radius, own=None):
     """Fit position and flux of stars, each on the pixels within a radius of its start.
 
     Parameters
     ----------
-    image, rms : (ny, nx) ndarray
-        Image without background, and the noise of the background.
-    mask : (ny, nx) bool ndarray or None
-        True where a pixel must not be used.
+    field : Field
+        Pixels.
     profile : Profile
         The PSF.
     noise : Noise
         Variance of the pixels.
-    x, y, flux : (N,) ndarray
+    stars : Stars
         Start values.
     radius : float
         Radius in px of the pixels used.
-    own : (x, y, flux) tuple of (N,) ndarray, optional
+    own : Stars, optional
         Models of these stars were subtracted from the image: each star gets its own back.
 
     Returns
@@ -95,23 +160,22 @@ def fit_stars(image, rms, mask, profile, noise, x, y, flux, *, radius, own=None)
         The fits.
     """
     parts = []
-    for start in range(0, max(len(x), 1), _CHUNK):
+    for start in range(0, max(len(stars.x), 1), _CHUNK):
         rows = slice(start, start + _CHUNK)
-        star = (x[rows], y[rows], flux[rows])
-        mine = None if own is None else tuple(column[rows] for column in own)
-        parts.append(_fit_chunk(image, rms, mask, profile, noise, star, radius, mine))
-    return StarFits(*(np.concatenate(columns) for columns in zip(*parts)))
+        mine = None if own is None else own.take(rows)
+        parts.append(_fit_chunk(field, profile, noise, stars.take(rows), radius, mine))
+    x, y, flux, *rest = (np.concatenate(columns) for columns in zip(*parts))
+    return StarFits(Stars(x, y, flux), *rest)
 
 
-def _fit_chunk(image, rms, mask, profile, noise, star, radius, own):
-    x, y, flux = (np.array(v, dtype=float) for v in star)
-    xc, yc = np.rint(x).astype(int), np.rint(y).astype(int)
+def _fit_chunk(field, profile, noise, stars, radius, own):
     half = int(np.ceil(radius))
-    pixels, use, sky = _pixels(image, rms, mask, xc, yc, half, radius)
+    xc, yc, pixels, use, sky = field.cut(stars, half, radius)
     if own is not None:
-        weights = profile.node_weights(own[0], own[1])
-        model = profile.evaluate(own[0] - xc, own[1] - yc, half, weights, gradient=False)[0]
-        pixels += own[2][:, None] * model
+        weights = profile.node_weights(own.x, own.y)
+        model = profile.evaluate(own.x - xc, own.y - yc, half, weights, gradient=False)[0]
+        pixels += own.flux[:, None] * model
+    x, y, flux = (np.array(v, dtype=float) for v in stars)
     weights = profile.node_weights(x, y) if len(profile.coefficients) > 1 else None
     flux = np.maximum(flux, 1e-6)
     x0, y0 = x.copy(), y.copy()
@@ -147,16 +211,6 @@ def _fit_chunk(image, rms, mask, profile, noise, star, radius, own):
     return x, y, flux, covariance, chi2, valid
 
 
-def _pixels(image, rms, mask, xc, yc, half, radius):
-    """Pixels, which of them to use, and their background's variance."""
-    pixels, use = cutouts(image, xc, yc, half)
-    step = np.arange(-half, half + 1)
-    use &= (np.hypot(step[:, None], step) <= radius).ravel()
-    if mask is not None:
-        use &= ~cutouts(mask, xc, yc, half)[0]
-    return pixels.astype(float), use, cutouts(rms, xc, yc, half)[0].astype(float) ** 2
-
-
 def _normal_step(basis, flux, pixels, use, sky, noise):
     """Gauss-Newton step (N, 3), covariance (N, 3, 3) and reduced chi square."""
     model = flux[:, None] * basis[0]
@@ -181,7 +235,7 @@ def _normal_step(basis, flux, pixels, use, sky, noise):
     return step, covariance, (weight * residual**2).sum(axis=1) / freedom
 
 
-def render(shape, profile, x, y, flux, *, faintest=0.0):
+def render(shape, profile, stars, *, faintest=0.0):
     """Image of the stars' models.
 
     Parameters
@@ -190,7 +244,7 @@ def render(shape, profile, x, y, flux, *, faintest=0.0):
         Shape of the image.
     profile : Profile
         The PSF.
-    x, y, flux : (N,) ndarray
+    stars : Stars
         The stars.
     faintest : float, optional
         Counts that may be left out in the wings of a star; faint stars are drawn smaller.
@@ -200,6 +254,7 @@ def render(shape, profile, x, y, flux, *, faintest=0.0):
     (ny, nx) float32 ndarray
         The image.
     """
+    x, y, flux = stars
     image = np.zeros(shape, dtype=np.float32)
     flat = image.reshape(-1)
     samples = np.abs(profile.samples()).max(axis=0)
@@ -229,12 +284,42 @@ def render(shape, profile, x, y, flux, *, faintest=0.0):
     return image
 
 
-def estimate_noise(image, rms, mask, profile, noise, x, y, flux, *, radius, gain=None):
+def star_like(flux, chi2, valid, *, limit=2.5, width=31):
+    """Mark the fits that are no worse than those of sources of about the same flux.
+
+    Parameters
+    ----------
+    flux, chi2 : (N,) ndarray
+        Fluxes and reduced chi squares.
+    valid : (N,) bool ndarray
+        True where the fit converged.
+    limit : float, optional
+        Greatest chi square relative to what is typical of the sources next in flux.
+    width : int, optional
+        Number of sources compared with.
+
+    Returns
+    -------
+    (N,) bool ndarray
+        True for single stars, as far as can be told.
+    """
+    rows = np.flatnonzero(valid)
+    if len(rows) < 5:
+        return valid.copy()
+    rows = rows[np.argsort(flux[rows])]
+    # Below the median: galaxies and cosmic rays may be the majority.
+    typical = percentile_filter(chi2[rows], 35, size=min(width, len(rows)), mode="nearest")
+    result = np.zeros(len(flux), bool)
+    result[rows] = chi2[rows] < limit * typical
+    return result
+
+
+def estimate_noise(field, profile, noise, stars, *, radius, gain=None):
     """Learn from residuals of well measured stars how far the profile is off, and the gain.
 
     Parameters
     ----------
-    image, rms, mask, profile, noise, x, y, flux, radius
+    field, profile, noise, stars, radius
         As for `fit_stars`; stars where the fit has converged.
     gain : float, optional
         Electrons per count; estimated if not given.
@@ -244,14 +329,15 @@ def estimate_noise(image, rms, mask, profile, noise, x, y, flux, *, radius, gain
     Noise
         Noise with the new gain and mismatch.
     """
-    xc, yc = np.rint(x).astype(int), np.rint(y).astype(int)
     half = int(np.ceil(radius))
-    pixels, use, sky = _pixels(image, rms, mask, xc, yc, half, radius)
-    basis = profile.evaluate(x - xc, y - yc, half, profile.node_weights(x, y))
+    xc, yc, pixels, use, sky = field.cut(stars, half, radius)
+    weights = profile.node_weights(stars.x, stars.y)
+    basis = profile.evaluate(stars.x - xc, stars.y - yc, half, weights)
+    flux = stars.flux
     model = flux[:, None] * basis[0]
     use &= model > np.sqrt(sky)
     weight = use / noise.variance(sky, model)
-    jacobian = np.stack([model * 0 + flux[:, None] * b for b in basis[1:]] + [basis[0]], axis=1)
+    jacobian = np.stack([flux[:, None] * b for b in basis[1:]] + [basis[0]], axis=1)
     normal = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
     good = use.sum(axis=1) >= 6
     normal[~good] = np.eye(3)
@@ -265,14 +351,23 @@ def estimate_noise(image, rms, mask, profile, noise, x, y, flux, *, radius, gain
     order = np.argsort(model)
     bins = np.array_split(order, int(np.clip(len(order) // 50, 1, 40)))
     # 1.4826 MAD squared = median of the squares / 0.4549
-    measured = np.array([np.median(residual2[b]) for b in bins]) / 0.4549
+    measured = np.array([np.median(residual2[b]) for b in bins]) / 0.4549 + 1e-30
     m, s = (np.array([np.mean(v[b]) for b in bins]) for v in (model, sky))
-    fixed = s if gain is None else s + m / gain
-    columns = np.stack(([m] if gain is None else []) + [m**2], axis=1)
-    # The error of a variance is proportional to it: relative residuals, reweighted by the model.
-    expected = np.maximum(measured, s)
-    for _ in range(5):
-        solution, _norm = nnls(columns / expected[:, None], (measured - fixed) / expected)
-        expected = fixed + columns @ solution
-    inverse_gain = solution[0] if gain is None else 1 / gain
-    return Noise(float(inverse_gain), float(np.sqrt(solution[-1])))
+    known = s if gain is None else s + m / gain
+
+    def variance(logs):
+        photons = m * np.exp(logs[1]) if gain is None else 0.0
+        return known + photons + np.exp(2 * logs[0]) * m**2
+
+    # Ratios, not differences: a variance is uncertain in proportion to itself; and robustly, for
+    # galaxies among the stars.
+    start = [np.log(0.02)] + ([np.log(0.1 * np.median(s / m))] if gain is None else [])
+    logs = least_squares(
+        lambda logs: np.log(measured / variance(logs)),
+        start,
+        bounds=([np.log(1e-4)] + [-30] * (gain is None), [np.log(0.5)] + [30] * (gain is None)),
+        loss="soft_l1",
+        f_scale=0.2,
+    ).x
+    inverse_gain = np.exp(logs[1]) if gain is None else 1 / gain
+    return Noise(float(inverse_gain), float(np.exp(logs[0])))

@@ -2,6 +2,7 @@
 
 import logging
 import warnings
+from dataclasses import replace
 
 import numpy as np
 from astropy.nddata import NDData
@@ -13,7 +14,15 @@ from wpdc_gwcs.centroids._build import (
     select_stars,
     vary_profile,
 )
-from wpdc_gwcs.centroids._fit import Noise, estimate_noise, fit_stars, render
+from wpdc_gwcs.centroids._fit import (
+    Field,
+    Noise,
+    Stars,
+    estimate_noise,
+    fit_stars,
+    render,
+    star_like,
+)
 from wpdc_gwcs.centroids._profile import Profile, moffat_samples, spline_coefficients
 from wpdc_gwcs.exceptions import CentroidWarning
 
@@ -24,9 +33,12 @@ log = logging.getLogger(__name__)
 # The bit of the column ``flags`` for a failed fit, as in `wpdc_gwcs.detection`.
 _FLAG_FIT_FAILED = 64
 
+_MAX_ROUNDNESS = 0.4
+# Stars whose residuals tell the error of the PSF.
+_MAX_STARS = 1000
 _MIN_STARS = 8
-# Stars per place from which a PSF that varies over the detector is tried.
-_STARS_PER_NODE = 15
+# Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
+_STARS_FOR_DEGREE = (30, 60, 200)
 
 
 def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0, vary="auto"):
@@ -78,15 +90,17 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
     >>> sources = detect_sources(background)  # doctest: +SKIP
     >>> epsf = build_epsf(background, sources)  # doctest: +SKIP
     """
-    image, rms, mask = _image_of(data, error)
+    field = _field_of(data, error)
     if vary not in ("auto", "never"):
         raise ValueError(f"vary must be 'auto' or 'never', got {vary!r}")
-    x, y, flux, snr = (np.asarray(sources[c], dtype=float) for c in ("x", "y", "flux", "snr"))
-    quality = np.asarray(sources["flags"]) == 0
+    stars = _stars_of(sources)
+    snr = np.asarray(sources["snr"], dtype=float)
+    flags, is_round = _flags_and_shape(sources)
+    quality = is_round & (flags == 0)
     fwhm = _typical_fwhm(sources)
-    rows = select_stars(x, y, flux, snr, quality, fwhm, image.shape, n_max=n_max, min_snr=min_snr)
+    rows = select_stars(stars, snr, quality, fwhm, field.image.shape, n_max=n_max, min_snr=min_snr)
     if len(rows) >= _MIN_STARS:
-        profile = _learn(image, rms, mask, (x[rows], y[rows], flux[rows]), fwhm, gain, vary)
+        profile = _learn(field, stars.take(rows), fwhm, gain, vary)
         if profile is not None:
             return _to_photutils(profile)
     warnings.warn(
@@ -97,39 +111,39 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
     return None
 
 
-def _learn(image, rms, mask, stars, fwhm, gain, vary):
+def _learn(field, stars, fwhm, gain, vary):
     """Profile from the stars chosen, or None if the fits fail."""
     half = int(np.clip(np.ceil(3 * fwhm), 6, 20)) + 1
     radius = _fit_radius(fwhm)
+    wide = radius + 0.5 * fwhm
     noise = Noise(0.0 if gain is None else 1 / gain, 0.03)
-    brightest = tuple(column[:200] for column in stars)
-    shape, _ = fit_moffat(
-        image, rms, mask, noise, brightest, fwhm, half=half, radius=radius + 0.5 * fwhm
-    )
-    base = moffat_samples(shape, half, OVERSAMPLING)
-    profile, fitted, _kept, noise = learn_profile(
-        image, rms, mask, noise, stars, base, fwhm=fwhm, radius=radius, gain=gain
-    )
-    n = len(fitted[0])
+    shape = fit_moffat(field, noise, stars.take(slice(200)), fwhm, half=half, radius=wide)
+    start = Profile.constant(moffat_samples(shape, half, OVERSAMPLING), OVERSAMPLING)
+    options = {"fwhm": fwhm, "radius": radius, "gain": gain}
+    profile, stars, noise = learn_profile(field, noise, stars, start, iterations=3, **options)
+    n = len(stars.x)
     if n < _MIN_STARS:
         return None
     log.info("effective PSF from %d stars, own error %.3f", n, noise.mismatch)
-    n_nodes = int(min(4, np.sqrt(n / _STARS_PER_NODE)))
-    if vary == "never" or n_nodes < 2:
+    degree = int(np.searchsorted(_STARS_FOR_DEGREE, n))
+    if vary == "never" or degree == 0:
         return profile
     # Every fifth star, by brightness, is left out to judge by.
     left_out = np.arange(n) % 5 == 2
-    learn = tuple(column[~left_out] for column in fitted)
-    test = tuple(column[left_out] for column in fitted)
-    varying = vary_profile(image, rms, mask, noise, learn, profile, fwhm, image.shape, n_nodes)
+    options["iterations"] = 2
+    trial = {"radius": wide, "degree": degree}
+    varying = vary_profile(field, noise, stars.take(~left_out), profile, fwhm, **trial)
     chi2 = [
-        np.median(fit_stars(image, rms, mask, p, noise, *test, radius=radius).chi2)
+        np.median(fit_stars(field, p, noise, stars.take(left_out), radius=radius).chi2)
         for p in (profile, varying)
     ]
     log.info("chi2 of left-out stars: constant PSF %.3f, varying %.3f", *chi2)
     if not chi2[1] < 0.99 * chi2[0]:
         return profile
-    return vary_profile(image, rms, mask, noise, fitted, profile, fwhm, image.shape, n_nodes)
+    varying = vary_profile(field, noise, stars, profile, fwhm, **trial)
+    varying, stars, noise = learn_profile(field, noise, stars, varying, **options)
+    log.info("own error of the varying PSF %.3f", noise.mismatch)
+    return varying if len(stars.x) >= _MIN_STARS else profile
 
 
 def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
@@ -172,45 +186,35 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
     --------
     >>> fit_centroids(background, sources, epsf)  # doctest: +SKIP
     """
-    image, rms, mask = _image_of(data, error)
+    field = _field_of(data, error)
     if passes < 1:
         raise ValueError(f"passes must be at least 1, got {passes}")
     profile = _from_photutils(epsf)
     fwhm = _typical_fwhm(sources)
     radius = _fit_radius(fwhm)
-    x, y, flux = (np.array(sources[c], dtype=float) for c in ("x", "y", "flux"))
-    flags = (
-        np.array(sources["flags"], dtype=int)
-        if "flags" in sources.colnames
-        else np.zeros(len(x), int)
-    )
+    stars = _stars_of(sources)
+    flags, is_round = _flags_and_shape(sources)
     noise = Noise(0.0 if gain is None else 1 / gain, 0.02)
-    faintest = 0.1 * float(np.median(rms[:: max(1, rms.shape[0] // 500)]))
-    work, own, fits = image, None, None
+    step = max(1, min(field.rms.shape) // 500)
+    faintest = 0.1 * float(np.median(field.rms[::step, ::step]))
+    work, own = field, None
     for number in range(passes):
-        fits = fit_stars(work, rms, mask, profile, noise, x, y, flux, radius=radius, own=own)
-        near = np.hypot(fits.x - sources["x"], fits.y - sources["y"]) < max(0.5 * fwhm, 1.0)
-        good = fits.valid & near
-        x, y, flux = (
-            np.where(good, new, old) for new, old in zip((fits.x, fits.y, fits.flux), (x, y, flux))
-        )
+        fits = fit_stars(work, profile, noise, stars, radius=radius, own=own)
+        moved = np.hypot(fits.stars.x - sources["x"], fits.stars.y - sources["y"])
+        good = fits.valid & (moved < max(0.5 * fwhm, 1.0))
+        stars = Stars(*(np.where(good, new, old) for new, old in zip(fits.stars, stars)))
         if number == 0:
-            noise = _noise_of_frame(
-                image, rms, mask, profile, noise, (x, y, flux), good & (flags == 0), radius, gain
+            clean = np.flatnonzero(star_like(stars.flux, fits.chi2, good & is_round & (flags == 0)))
+            brightest = clean[np.argsort(stars.flux[clean])[::-1][:_MAX_STARS]]
+            noise = estimate_noise(
+                field, profile, noise, stars.take(brightest), radius=radius, gain=gain
             )
+            log.info("noise of the fits: %s", noise)
         if number < passes - 1:
-            own = (x, y, np.where(good, flux, 0.0))
-            work = image - render(image.shape, profile, *own, faintest=faintest)
+            own = stars._replace(flux=np.where(good, stars.flux, 0.0))
+            model = render(field.image.shape, profile, own, faintest=faintest)
+            work = replace(field, image=field.image - model)
     return _fitted_table(sources, fits, good, flags)
-
-
-def _noise_of_frame(image, rms, mask, profile, noise, stars, clean, radius, gain):
-    """Noise with the mismatch of the profile (and the gain) from the brightest clean stars."""
-    rows = np.flatnonzero(clean)
-    rows = rows[np.argsort(stars[2][rows])[::-1][:1000]]
-    return estimate_noise(
-        image, rms, mask, profile, noise, *(c[rows] for c in stars), radius=radius, gain=gain
-    )
 
 
 def _fitted_table(sources, fits, good, flags):
@@ -218,13 +222,13 @@ def _fitted_table(sources, fits, good, flags):
     result = sources.copy()
     error = np.sqrt(np.where(good[:, None], np.einsum("sii->si", fits.covariance), np.nan))
     with np.errstate(divide="ignore", invalid="ignore"):
-        snr = fits.flux / error[:, 2]
+        snr = fits.stars.flux / error[:, 2]
     columns = {
-        "x": fits.x,
-        "y": fits.y,
+        "x": fits.stars.x,
+        "y": fits.stars.y,
         "x_err": error[:, 0],
         "y_err": error[:, 1],
-        "flux": fits.flux,
+        "flux": fits.stars.flux,
         "flux_err": error[:, 2],
         "snr": snr,
     }
@@ -234,6 +238,21 @@ def _fitted_table(sources, fits, good, flags):
     result["chi2"] = np.where(good, fits.chi2, np.nan)
     result["flags"] = flags | np.where(good, 0, _FLAG_FIT_FAILED)
     return result
+
+
+def _flags_and_shape(sources):
+    """Flags, and whether the sources are round enough for stars; all good if there is no column."""
+    n = len(sources)
+    flags = (
+        np.array(sources["flags"], dtype=int) if "flags" in sources.colnames else np.zeros(n, int)
+    )
+    if "roundness" not in sources.colnames:
+        return flags, np.ones(n, bool)
+    return flags, np.abs(np.asarray(sources["roundness"], dtype=float)) < _MAX_ROUNDNESS
+
+
+def _stars_of(sources):
+    return Stars(*(np.array(sources[c], dtype=float) for c in ("x", "y", "flux")))
 
 
 def _fit_radius(fwhm):
@@ -249,12 +268,12 @@ def _typical_fwhm(sources):
     raise ValueError("the sources have no FWHM: neither a column nor an entry in meta")
 
 
-def _image_of(data, error):
+def _field_of(data, error):
     """Image, noise and mask of a Background, or of a plain array and its error."""
     if hasattr(data, "rms"):
         if error is not None:
             raise ValueError("error must not be given: the Background has its own")
-        return data.image, data.rms, data.mask
+        return Field(data.image, data.rms, data.mask)
     image = np.asarray(data)
     if image.ndim != 2:
         raise ValueError(f"the image must be 2-D, got {image.ndim} dimensions")
@@ -264,7 +283,7 @@ def _image_of(data, error):
     rms = np.broadcast_to(np.asarray(error, dtype=float), image.shape)
     if not (rms > 0).all():
         raise ValueError("error must be positive")
-    return np.where(bad, 0.0, image), rms, bad if bad.any() else None
+    return Field(np.where(bad, 0.0, image), rms, bad if bad.any() else None)
 
 
 def _to_photutils(profile):
