@@ -1,0 +1,27 @@
+"""The chain from frames and a catalogue to calibrated WCS: the only module that knows every stage.
+
+::
+
+    frame --measure--> sources --match--> pairs --solve--> instrument + attitudes --check--> WCS
+           catalog --cone, epoch--> reference ^                 |
+                                              '--- re-match ----'
+
+A frame is the unit of work: it is measured and matched alone (`match_frame`), in a process of its
+own with ``jobs > 1``.  The frames of one detector are then solved together, because they share one
+instrument (`solve_detector`).
+"""
+
+from wpdc_gwcs.calibration.detector import solve_detector
+from wpdc_gwcs.calibration.matched import MatchedFrame, match_frame, measure_sources
+from wpdc_gwcs.calibration.run import CalibrationRun, calibrate
+from wpdc_gwcs.calibration.settings import Settings
+
+__all__ = [
+    "CalibrationRun",
+    "MatchedFrame",
+    "Settings",
+    "calibrate",
+    "match_frame",
+    "measure_sources",
+    "solve_detector",
+]

@@ -1,0 +1,79 @@
+"""Does a solution agree with its own stars?  One that does not is never delivered."""
+
+import numpy as np
+
+from wpdc_gwcs.calibration.start import undistort
+from wpdc_gwcs.evaluation import binned_residuals, evaluate
+from wpdc_gwcs.exceptions import FitError
+
+__all__ = ["check_solution"]
+
+_MIN_STARS = 10
+_MAX_SIGMA = 1.0  # px
+
+
+def check_solution(frame, matches, instrument):
+    """Raise an error unless the solution of a frame agrees with its stars, everywhere.
+
+    Parameters
+    ----------
+    frame : MatchedFrame
+        The frame, for its shape and for messages.
+    matches : `~astropy.table.Table`
+        Columns ``x``, ``y``, residuals ``dx``, ``dy`` in px, and ``used``.
+    instrument : DistortionSolution
+        The distortion the frame was solved with.
+
+    Raises
+    ------
+    FitError
+        If too few stars agree, they scatter too much, a part of the frame is off as a whole, or the
+        map folds.
+
+    Notes
+    -----
+    The pairs have been tested against chance before; what is tested here is the map.
+    """
+    used = np.asarray(matches["used"])
+    dx, dy = np.asarray(matches["dx"]), np.asarray(matches["dy"])
+    statistics = evaluate(dx[used], dy[used])
+    if statistics.n < _MIN_STARS:
+        raise FitError(
+            f"{frame.source}: {statistics.n} stars agree with the solution, at least "
+            f"{_MIN_STARS} must"
+        )
+    sigma = max(statistics.sigma_dx, statistics.sigma_dy)
+    if not sigma <= _MAX_SIGMA:
+        raise FitError(
+            f"{frame.source}: the residuals scatter by {sigma:.2f} px, at most {_MAX_SIGMA} px are "
+            "accepted"
+        )
+    ny, nx = frame.image_shape
+    x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, 33), np.linspace(-0.5, ny - 0.5, 33))
+    ux, uy = undistort(instrument, x, y)
+    area = np.gradient(ux, axis=1) * np.gradient(uy, axis=0)
+    area -= np.gradient(ux, axis=0) * np.gradient(uy, axis=1)
+    area /= (nx / 32) * (ny / 32)
+    if not np.all((area > 0.5) & (area < 2.0)):
+        raise FitError(
+            f"{frame.source}: the solution stretches the detector by {np.nanmin(area):.2f} to "
+            f"{np.nanmax(area):.2f} in area, 0.5 to 2 is accepted: the stars do not determine the "
+            "distortion everywhere"
+        )
+    mean_dx, mean_dy, count = binned_residuals(
+        np.asarray(matches["x"])[used],
+        np.asarray(matches["y"])[used],
+        dx[used],
+        dy[used],
+        image_shape=frame.image_shape,
+        n_bins=4,
+    )
+    settled = count >= 10
+    limit = np.maximum(6 * sigma / np.sqrt(np.where(settled, count, 1)), sigma)
+    off = settled & (np.hypot(mean_dx, mean_dy) > limit)
+    if off.any():
+        worst = np.nanmax(np.hypot(mean_dx, mean_dy)[off])
+        raise FitError(
+            f"{frame.source}: {off.sum()} of {settled.sum()} parts of the frame are off by up to "
+            f"{worst:.2f} px"
+        )

@@ -1,0 +1,225 @@
+"""One frame, measured on its image and matched to the reference catalogue."""
+
+import logging
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import Table
+
+from wpdc_gwcs.calibration.settings import Settings
+from wpdc_gwcs.calibration.start import (
+    LinearWCS,
+    detector_center,
+    header_reference_point,
+    linear_wcs,
+    sky_of,
+    undistort,
+)
+from wpdc_gwcs.catalogs import propagate, select_cone
+from wpdc_gwcs.centroids import build_epsf, fit_centroids
+from wpdc_gwcs.detection import detect_sources, subtract_background
+from wpdc_gwcs.exceptions import DetectionError, MatchError
+from wpdc_gwcs.matching import match_planes
+
+__all__ = ["MatchedFrame", "match_frame", "measure_sources"]
+
+log = logging.getLogger(__name__)
+
+# Stars kept for matching and fitting (the paper's section 3.1): rounder than galaxies, and well
+# measured.
+_MAX_ROUNDNESS = 0.3
+_MIN_SNR = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedFrame:
+    """One frame, measured and matched: what the joint solution of its detector needs."""
+
+    name: str
+    source: str
+    detector: str
+    image_shape: tuple[int, int]
+    wcs: object
+    sources: Table
+    usable: np.ndarray  # mask over sources
+    reference: Table  # at the epoch of the frame, with catalog_index
+    pairs: tuple[np.ndarray, np.ndarray]  # rows of sources and of reference
+    start: LinearWCS
+    diagnostics: object
+    from_image: bool
+    seconds: float
+
+    @property
+    def n_sources(self):
+        """Number of sources."""
+        return len(self.sources)
+
+
+def measure_sources(frame, settings=None):
+    """Source table of a frame: measured on its image, or read from its source list.
+
+    Parameters
+    ----------
+    frame : Frame
+        Image or source list.
+    settings : Settings, optional
+        ``centroids`` and ``threshold`` are used.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        Columns ``x``, ``y`` (px, zero based) and what else was measured.
+
+    Raises
+    ------
+    DetectionError
+        If there are no stars on the image, or no rows in the list.
+    """
+    settings = Settings() if settings is None else settings
+    if frame.load_sources is not None:
+        sources = frame.load_sources()
+        if len(sources) == 0:
+            raise DetectionError(f"{frame.source}: the source list has no rows")
+        return sources
+    if settings.centroids == "given":
+        raise DetectionError(
+            f"{frame.source}: centroids 'given' needs a source list, and this is an image"
+        )
+    image = frame.load_image()
+    background = subtract_background(image)
+    sources = detect_sources(
+        background,
+        threshold=settings.threshold,
+        gain=frame.gain,
+        saturation=frame.saturation,
+    )
+    if settings.centroids == "windowed":
+        return sources
+    epsf = build_epsf(background, sources, gain=frame.gain)
+    if epsf is None:
+        return sources
+    return fit_centroids(background, sources, epsf, gain=frame.gain)
+
+
+def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
+    """Measure one frame and match it to the reference catalogue.
+
+    Parameters
+    ----------
+    frame : Frame
+        Image or source list.
+    catalog : `~astropy.table.Table`
+        Reference catalogue as returned by `read_catalog`.
+    settings : Settings, optional
+        Choices; the defaults work for any camera.
+    sources : `~astropy.table.Table`, optional
+        What `measure_sources` found, where that has been done already.
+    solution : DistortionSolution, optional
+        Stored solution of the detector, which takes the distortion off before the match.
+
+    Returns
+    -------
+    MatchedFrame
+        Sources, reference stars at the epoch of the frame, and the pairs.
+
+    Raises
+    ------
+    DetectionError, MatchError
+        If there are no stars, or the evidence for a match is not there.
+    """
+    settings = Settings() if settings is None else settings
+    began = time.perf_counter()
+    if sources is None:
+        sources = measure_sources(frame, settings)
+    usable = _usable(sources, frame.image_shape)
+    x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)
+    if solution is None:
+        start = linear_wcs(frame.wcs, header_reference_point(frame))
+        xs, ys = start.pixels(*sky_of(frame.wcs, x, y))
+    else:
+        start = linear_wcs(frame.wcs, solution.crpix)
+        xs, ys = undistort(solution, x, y)
+    reference = _reference_in_reach(frame, catalog, start, settings)
+    xr, yr = start.pixels(np.asarray(reference["ra"]), np.asarray(reference["dec"]))
+    pick = np.flatnonzero(usable & np.isfinite(xs) & np.isfinite(ys))
+    i_src, i_ref, diagnostics = match_planes(
+        xs[pick],
+        ys[pick],
+        xr,
+        yr,
+        flux=optional_column(sources, "flux", pick),
+        mag=optional_column(reference, "phot_g_mean_mag"),
+        x_err=optional_column(sources, "x_err", pick),
+        y_err=optional_column(sources, "y_err", pick),
+        image_shape=frame.image_shape,
+        blind=settings.blind,
+    )
+    log.info("%s: %d of %d sources matched", frame.name, len(i_src), len(sources))
+    return MatchedFrame(
+        name=frame.name,
+        source=frame.source,
+        detector=frame.detector,
+        image_shape=frame.image_shape,
+        wcs=frame.wcs,
+        sources=sources,
+        usable=usable,
+        reference=reference,
+        pairs=(pick[i_src], i_ref),
+        start=start,
+        diagnostics=diagnostics,
+        from_image=frame.load_image is not None,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def optional_column(table, name, rows=slice(None)):
+    """Rows of a column as floats, or None where the table does not have it.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        Any table.
+    name : str
+        Name of the column.
+    rows : slice or array_like, optional
+        Rows; default all.
+
+    Returns
+    -------
+    ndarray or None
+        Values.
+    """
+    return np.asarray(table[name], dtype=float)[rows] if name in table.colnames else None
+
+
+def _usable(sources, image_shape):
+    """Mark the sources that may enter the match: clean, round, well measured, on the detector."""
+    ny, nx = image_shape
+    x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)
+    with np.errstate(invalid="ignore"):
+        usable = (x >= -0.5) & (x <= nx - 0.5) & (y >= -0.5) & (y <= ny - 0.5)
+        if "flags" in sources.colnames:
+            usable &= np.asarray(sources["flags"]) == 0
+        if "roundness" in sources.colnames:
+            usable &= np.abs(np.asarray(sources["roundness"], float)) <= _MAX_ROUNDNESS
+        if "snr" in sources.colnames:
+            usable &= np.asarray(sources["snr"], float) > _MIN_SNR
+    return usable
+
+
+def _reference_in_reach(frame, catalog, start, settings):
+    """Select the reference stars that the frame can show, at its epoch."""
+    ny, nx = frame.image_shape
+    center = detector_center(frame.image_shape)
+    ra, dec = (float(c) for c in np.ravel(sky_of(frame.wcs, *center[:, None])))
+    # As wide as the match searches, see `match_planes`.
+    margin = max(nx, ny) * (0.5 if settings.blind else 0.2) + 500
+    radius = (np.hypot(nx, ny) / 2 + margin) * start.scale
+    near = select_cone(catalog, ra, dec, radius)
+    if len(near) == 0:
+        raise MatchError(
+            f"{frame.source}: the catalogue has no star within {radius:.3f} deg of the frame's "
+            f"centre, RA {ra:.4f} Dec {dec:.4f} deg"
+        )
+    return near if frame.epoch is None else propagate(near, frame.epoch)

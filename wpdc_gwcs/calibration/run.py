@@ -1,0 +1,237 @@
+"""A whole run: every frame matched, every detector solved, one summary."""
+
+import time
+from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing import get_context
+
+import numpy as np
+from astropy.table import QTable
+
+from wpdc_gwcs.calibration.detector import solve_detector
+from wpdc_gwcs.calibration.matched import match_frame, measure_sources
+from wpdc_gwcs.calibration.settings import Settings
+from wpdc_gwcs.exceptions import FitError, FrameFailure, WPDCError
+
+__all__ = ["CalibrationRun", "calibrate"]
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationRun:
+    """Everything a call of `calibrate` found.
+
+    Parameters
+    ----------
+    calibrations : list of `Calibration`
+        One for each solved frame, in the order of the input.
+    solutions : dict
+        Detector name to `DistortionSolution`.
+    failures : dict
+        Frame name to the error that kept it from being solved.
+    summary : `~astropy.table.QTable`
+        One row per frame: status, reason, counts, residual statistics, seconds.
+    """
+
+    calibrations: list
+    solutions: dict
+    failures: dict
+    summary: QTable = field(repr=False)
+
+
+def calibrate(
+    frames,
+    catalog,
+    *,
+    solution=None,
+    update=False,
+    settings=None,
+    jobs=1,
+    executor=None,
+    progress=None,
+):
+    """Calibrate frames against a reference catalogue.
+
+    Parameters
+    ----------
+    frames : Frame or sequence of Frame
+        What `wpdc_gwcs.io.read_frames` returns; names must be unique.
+    catalog : `~astropy.table.Table`
+        Reference catalogue as returned by `read_catalog`.
+    solution : DistortionSolution or mapping, optional
+        Stored solution (or detector name to solution): only the attitudes of the frames are fitted.
+    update : bool, optional
+        Merge the new frames into the stored solution instead of keeping it fixed.
+    settings : Settings, optional
+        Choices; the defaults work for any camera.
+    jobs : int, optional
+        Processes in which frames are measured and matched.
+    executor : concurrent.futures.Executor, optional
+        Where frames are measured and matched instead, for example
+        ``dask.distributed.Client(...).get_executor()``.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)`` while the run goes on.
+
+    Returns
+    -------
+    CalibrationRun
+        Frames that could not be solved are in ``failures`` and have no calibration.
+
+    Raises
+    ------
+    ValueError
+        If two frames have the same name, or there is none.
+
+    References
+    ----------
+    WPDC-2P, arXiv:2603.09193.
+    """
+    frames = list(frames) if isinstance(frames, (list, tuple)) else [frames]
+    settings = Settings() if settings is None else settings
+    if not frames:
+        raise ValueError("calibrate needs at least one frame")
+    names = [frame.name for frame in frames]
+    if len(set(names)) < len(names):
+        twice = sorted({n for n in names if names.count(n) > 1})
+        raise ValueError(f"frame names must be unique, got twice: {', '.join(twice)}")
+    if jobs < 1:
+        raise ValueError(f"jobs must be at least 1, got {jobs}")
+    progress = progress or (lambda stage, done, total: None)
+
+    results = _match_frames(frames, catalog, solution, settings, jobs, executor, progress)
+    failures = {n: r.error for n, r in results.items() if isinstance(r, FailedFrame)}
+    matched = [r for r in results.values() if not isinstance(r, FailedFrame)]
+
+    solutions, calibrations = {}, {}
+    detectors = list(dict.fromkeys(frame.detector for frame in matched))
+    holdout = _holdout_mask(catalog, settings)
+    for k, detector in enumerate(detectors):
+        progress("solve", k, len(detectors))
+        group = [frame for frame in matched if frame.detector == detector]
+        stored = solution.get(detector) if isinstance(solution, Mapping) else solution
+        try:
+            solved, found, failed = solve_detector(
+                group, settings, holdout=holdout, solution=stored, update=update
+            )
+        except FrameFailure as err:
+            failures.update({frame.name: err for frame in group})
+            continue
+        solutions[detector] = solved
+        calibrations.update({c.frame: c for c in found})
+        failures.update(failed)
+    progress("solve", len(detectors), len(detectors))
+    ordered = [calibrations[n] for n in names if n in calibrations]
+    summary = _summarize(frames, results, calibrations, failures)
+    return CalibrationRun(ordered, solutions, failures, summary)
+
+
+@dataclass(frozen=True)
+class FailedFrame:
+    """A frame that could not be matched, and why."""
+
+    error: WPDCError
+    n_sources: int
+    seconds: float
+
+
+def _match_or_fail(frame, catalog, solution, settings):
+    began = time.perf_counter()
+    sources = ()
+    try:
+        stored = _stored_for(solution, frame)
+        sources = measure_sources(frame, settings)
+        return match_frame(frame, catalog, settings, sources=sources, solution=stored)
+    except WPDCError as err:
+        return FailedFrame(err, len(sources), time.perf_counter() - began)
+
+
+# A worker process is given the catalogue once, not with each frame.
+_in_worker = {}
+
+
+def _start_worker(**common):
+    _in_worker.update(common)
+
+
+def _match_in_worker(frame):
+    return _match_or_fail(frame, **_in_worker)
+
+
+def _match_frames(frames, catalog, solution, settings, jobs, executor, progress):
+    """Frame name to `MatchedFrame` or error, in the order of the frames."""
+    common = {"catalog": catalog, "solution": solution, "settings": settings}
+    results = {}
+
+    def collect(run):
+        for frame, result in zip(frames, run, strict=True):
+            results[frame.name] = result
+            progress("match", len(results), len(frames))
+        return results
+
+    progress("match", 0, len(frames))
+    if executor is not None:
+        return collect(executor.map(partial(_match_or_fail, **common), frames))
+    if jobs == 1 or len(frames) == 1:
+        return collect(map(partial(_match_or_fail, **common), frames))
+    with ProcessPoolExecutor(
+        min(jobs, len(frames)),
+        mp_context=get_context("spawn"),
+        initializer=partial(_start_worker, **common),
+    ) as pool:
+        try:
+            return collect(pool.map(_match_in_worker, frames))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _stored_for(solution, frame):
+    """Find the stored solution of a frame's detector: solutions come alone or by detector."""
+    if isinstance(solution, Mapping):
+        solution = solution.get(frame.detector)
+    if solution is not None and tuple(solution.image_shape) != tuple(frame.image_shape):
+        raise FitError(
+            f"{frame.source}: the frame has shape (ny, nx) {tuple(frame.image_shape)}, the stored "
+            f"solution is for {tuple(solution.image_shape)}"
+        )
+    return solution
+
+
+def _holdout_mask(catalog, settings):
+    """Rows of the catalogue that are kept out of every fit, the same in all frames."""
+    if settings.holdout == 0:
+        return None
+    size = int(np.max(catalog["catalog_index"])) + 1
+    return np.random.default_rng(settings.seed).uniform(size=size) < settings.holdout
+
+
+def _summarize(frames, results, calibrations, failures):
+    """One row per frame, whatever became of it."""
+    rows = []
+    for frame in frames:
+        found = calibrations.get(frame.name)
+        result = results[frame.name]
+        row = {
+            "frame": frame.name,
+            "detector": frame.detector,
+            "status": "failed" if found is None else "solved",
+            "reason": " ".join(str(failures[frame.name]).split()) if found is None else "",
+            "n_sources": result.n_sources,
+            "n_matched": 0 if found is None else found.statistics["n_matched"],
+        }
+        statistics = {} if found is None else found.statistics
+        inside, outside = (statistics.get(key, {}) for key in ("residuals", "holdout"))
+        for name in ("mean_dx", "sigma_dx", "mean_dy", "sigma_dy"):
+            row[name] = inside.get(name, np.nan)
+        for name in ("sigma_dx", "sigma_dy"):
+            row[f"holdout_{name}"] = outside.get(name, np.nan)
+        row["rms_mas"] = statistics.get("rms_mas", np.nan)
+        row["seconds"] = statistics.get("seconds", result.seconds)
+        rows.append(row)
+    table = QTable(rows)
+    for name in table.colnames:
+        if "_d" in name:
+            table[name].unit = "pix"
+    table["rms_mas"].unit, table["seconds"].unit = "mas", "s"
+    return table

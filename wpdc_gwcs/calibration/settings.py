@@ -1,0 +1,81 @@
+"""Choices of a calibration."""
+
+from dataclasses import dataclass
+
+from wpdc_gwcs.fitting import RadialWeight
+
+__all__ = ["Settings"]
+
+_CHOICES = {
+    "centroids": ("psf", "windowed", "given"),
+    "reference_point": ("header", "center", "nearest-source"),
+    "refine": ("auto", "attitude", "pv"),
+    "lut": ("auto", "none"),
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Choices of a calibration; the defaults work for any camera.
+
+    Parameters
+    ----------
+    weight : str, optional
+        Radial weight of the polynomial fit: ``exp-sqrt`` (the paper's), ``gaussian``, ``inverse``,
+        ``inverse-square`` or ``uniform``.
+    r0 : float, optional
+        Radius in px within which all stars weigh the same; `None` is 0.87 times half the shorter
+        side.
+    n_grid : int, optional
+        Nodes of the look-up table along each axis.
+    lut : {'auto', 'none'}, optional
+        ``auto`` keeps a table where it lowers the cross-validated residual.
+    refine : {'auto', 'attitude', 'pv'}, optional
+        What is fitted per exposure: six linear numbers (``attitude``), the polynomial too
+        (``pv``), or whichever predicts left-out stars better (``auto``).
+    centroids : {'psf', 'windowed', 'given'}, optional
+        How positions are measured on images; source lists are always taken as given.
+    reference_point : {'header', 'center', 'nearest-source'}, optional
+        Where the tangent point and the polynomial's origin are.  A header's point that lies off
+        the detector is replaced by the centre.
+    threshold : float, optional
+        Detection threshold in standard deviations of the background.
+    holdout : float, optional
+        Share of the reference stars, 0 to 0.9, kept out of every fit and measured separately.
+    blind : bool, optional
+        Search a wide range of pointing, orientation, parity and scale for the match.
+    seed : int, optional
+        Seed of the random choice of held-out stars.
+    """
+
+    weight: str = "exp-sqrt"
+    r0: float | None = None
+    n_grid: int = 50
+    lut: str = "auto"
+    refine: str = "auto"
+    centroids: str = "psf"
+    reference_point: str = "header"
+    threshold: float = 5.0
+    holdout: float = 0.0
+    blind: bool = False
+    seed: int = 0
+
+    def __post_init__(self):
+        RadialWeight(self.weight, r0=1000.0 if self.r0 is None else self.r0)
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(
+                    f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
+                )
+        if not 4 <= self.n_grid <= 1000:
+            raise ValueError(f"n_grid must be between 4 and 1000, got {self.n_grid}")
+        if not 0 <= self.holdout <= 0.9:
+            raise ValueError(f"holdout must be between 0 and 0.9, got {self.holdout}")
+        if not self.threshold > 0:
+            raise ValueError(f"threshold must be positive, got {self.threshold}")
+
+    def radial_weight(self, image_shape):
+        """Radial weight for a detector of this shape ``(ny, nx)``."""
+        return RadialWeight(
+            self.weight, r0=0.87 * 0.5 * min(image_shape) if self.r0 is None else self.r0
+        )

@@ -1,0 +1,156 @@
+"""The linear tangent-plane WCS about a reference point that stands in for a header's WCS."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wpdc_gwcs.models import project
+
+__all__ = [
+    "LinearWCS",
+    "detector_center",
+    "header_reference_point",
+    "linear_wcs",
+    "sky_of",
+    "undistort",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearWCS:
+    """Undistorted pixels to sky: reference point, matrix and tangent point.
+
+    Parameters
+    ----------
+    crpix : (2,) ndarray
+        Reference point, px, zero based.
+    cd : (2, 2) ndarray
+        Linear matrix, deg / px.
+    crval : (2,) ndarray
+        RA and Dec of the reference point, deg.
+    """
+
+    crpix: np.ndarray
+    cd: np.ndarray
+    crval: np.ndarray
+
+    @property
+    def scale(self):
+        """Pixel scale, deg / px."""
+        return float(np.sqrt(abs(np.linalg.det(self.cd))))
+
+    def pixels(self, ra, dec):
+        """Undistorted pixels of sky positions.
+
+        Parameters
+        ----------
+        ra, dec : (N,) array_like
+            ICRS, deg.
+
+        Returns
+        -------
+        (2, N) ndarray
+            Pixel coordinates x and y, zero based.
+        """
+        plane = np.array(project(np.asarray(ra, float), np.asarray(dec, float), self.crval))
+        return np.linalg.solve(self.cd, plane) + self.crpix[:, None]
+
+
+def sky_of(wcs, x, y):
+    """Sky position of pixels through the shared low-level interface of a WCS.
+
+    Parameters
+    ----------
+    wcs : object
+        With ``pixel_to_world_values``.
+    x, y : (N,) array_like
+        Pixel coordinates, zero based.
+
+    Returns
+    -------
+    ra, dec : (N,) ndarray
+        ICRS, deg.
+    """
+    ra, dec = wcs.pixel_to_world_values(np.asarray(x, float), np.asarray(y, float))
+    return np.asarray(ra, float), np.asarray(dec, float)
+
+
+def detector_center(image_shape):
+    """Centre of a detector.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Shape ``(ny, nx)``.
+
+    Returns
+    -------
+    (2,) ndarray
+        Pixel coordinates x and y, zero based.
+    """
+    ny, nx = image_shape
+    return np.array([(nx - 1) / 2, (ny - 1) / 2])
+
+
+def header_reference_point(frame):
+    """Find the reference point of the header, or the centre where it is not on the detector.
+
+    Parameters
+    ----------
+    frame : Frame
+        Any frame.
+
+    Returns
+    -------
+    (2,) ndarray
+        Pixel coordinates x and y, zero based.
+    """
+    ny, nx = frame.image_shape
+    center = detector_center(frame.image_shape)
+    header = getattr(frame.wcs, "wcs", None)
+    if header is None:
+        return center
+    crpix = np.asarray(header.crpix, float)[:2] - 1
+    on_detector = -0.5 <= crpix[0] <= nx - 0.5 and -0.5 <= crpix[1] <= ny - 0.5
+    return crpix if on_detector else center
+
+
+def linear_wcs(wcs, crpix):
+    """Tangent-plane WCS that touches another one at a point: exact for TAN, local for any other.
+
+    Parameters
+    ----------
+    wcs : object
+        With ``pixel_to_world_values``.
+    crpix : (2,) ndarray
+        The point, px, zero based.
+
+    Returns
+    -------
+    LinearWCS
+        With the same sky position, scale and orientation at the point.
+    """
+    crval = np.array(sky_of(wcs, *crpix[:, None])).ravel()
+    x = crpix[0] + np.array([1.0, -1.0, 0.0, 0.0])
+    y = crpix[1] + np.array([0.0, 0.0, 1.0, -1.0])
+    xi, eta = project(*sky_of(wcs, x, y), crval)
+    cd = 0.5 * np.array([[xi[0] - xi[1], xi[2] - xi[3]], [eta[0] - eta[1], eta[2] - eta[3]]])
+    return LinearWCS(crpix=crpix, cd=cd, crval=crval)
+
+
+def undistort(solution, x, y):
+    """Take the distortion of an instrument off detector pixels.
+
+    Parameters
+    ----------
+    solution : DistortionSolution
+        The instrument.
+    x, y : array_like
+        Detector pixels, zero based.
+
+    Returns
+    -------
+    x, y : ndarray
+        Undistorted pixels; NaN off the detector.
+    """
+    return solution.wcs.get_transform("detector", "undistorted")(x, y)

@@ -1,0 +1,148 @@
+"""The `wpdc` application: its commands, and what becomes of errors, warnings and Ctrl-C.
+
+Exit status: 0 all is well; 1 a frame could not be solved, or a result failed its test; 2 wrong
+usage or unreadable input; 130 interrupted.  Every failure is one line on standard error that says
+what, which rule and which value.
+"""
+
+import logging
+import os
+import sys
+import warnings
+from typing import Annotated
+
+import typer
+
+from wpdc_gwcs.exceptions import FrameFailure, InputError, WPDCError, WPDCWarning
+
+__all__ = ["app", "main", "set_verbosity"]
+
+app = typer.Typer(
+    name="wpdc",
+    help="Calibrate wide-field frames: image + Gaia in, trustworthy WCS with distortion out.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+# The common base of what the command-line parser complains about; typer exports only a subclass.
+UsageError = typer.BadParameter.__bases__[0]
+
+
+def _show_version(value: bool):
+    if value:
+        from wpdc_gwcs import __version__
+
+        typer.echo(f"wpdc_gwcs {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Show the version and exit.", callback=_show_version, is_eager=True
+        ),
+    ] = False,
+):
+    pass
+
+
+class _OneLine(logging.Formatter):
+    def format(self, record):
+        text = " ".join(record.getMessage().split())
+        if record.levelno >= logging.WARNING:
+            return f"wpdc: {record.levelname.lower()}: {text}"
+        return f"wpdc: {text}"
+
+
+def set_verbosity(verbose, quiet):
+    """Log to standard error: warnings, with ``-v`` progress, ``-vv`` details, ``-q`` only errors.
+
+    Parameters
+    ----------
+    verbose : int
+        How often ``-v`` was given.
+    quiet : bool
+        Whether ``-q`` was given.
+    """
+    level = (
+        logging.ERROR if quiet else [logging.WARNING, logging.INFO, logging.DEBUG][min(verbose, 2)]
+    )
+    logger = logging.getLogger("wpdc_gwcs")
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_OneLine())
+    logger.handlers = [handler]
+    logger.propagate = False
+    logger.setLevel(level)
+
+    def show(message, category, filename, lineno, file=None, line=None):
+        # Our own warnings are about the user's data; those of libraries are about code: -v.
+        ours = issubclass(category, WPDCWarning)
+        logger.log(logging.WARNING if ours else logging.INFO, "%s", message)
+
+    warnings.simplefilter("default")
+    warnings.showwarning = show
+
+
+def _fail(message, status):
+    print("wpdc: error: " + " ".join(str(message).split()), file=sys.stderr)
+    return status
+
+
+def run(args=None):
+    """Run the command line and return its exit status.
+
+    Parameters
+    ----------
+    args : list of str, optional
+        Arguments after the program's name; default ``sys.argv[1:]``.
+
+    Returns
+    -------
+    int
+        Exit status.
+    """
+    set_verbosity(0, quiet=False)
+    try:
+        status = app(args=args, prog_name="wpdc", standalone_mode=False)
+        sys.stdout.flush()
+        return status if isinstance(status, int) else 0
+    except UsageError as err:
+        return _usage(err)
+    except InputError as err:
+        return _fail(err, 2)
+    except (FrameFailure, WPDCError) as err:
+        return _fail(err, 1)
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("interrupted; files already written are complete", 130)
+    except BrokenPipeError:
+        # The reader of our output has gone, which is no error; the exit must not flush again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as err:
+        if err.filename is None:
+            return _fail(err.strerror or err, 2)
+        return _fail(f"{err.filename}: {err.strerror}", 2)
+
+
+def _usage(err):
+    message = err.format_message()
+    context = getattr(err, "ctx", None)
+    if type(err).__name__ == "NoArgsIsHelpError":
+        print(message)
+        return 2
+    command = context.command_path if context is not None else "wpdc"
+    return _fail(f"{message} (see '{command} --help')", 2)
+
+
+def main():
+    """Entry point of the `wpdc` command."""
+    sys.exit(run())
+
+
+# The commands register themselves with the application.
+from wpdc_gwcs.cli import calibrate, demo, files, stages  # noqa: E402, F401

@@ -1,0 +1,316 @@
+"""`wpdc calibrate`: frames and a catalogue in, WCS files out."""
+
+import logging
+import os
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.options import Config, Overwrite, Preset, Quiet, Verbose
+from wpdc_gwcs.cli.progress import progress_bar
+from wpdc_gwcs.exceptions import InputError
+
+log = logging.getLogger("wpdc_gwcs.cli")
+
+Catalog = Annotated[
+    str,
+    typer.Option(
+        "--catalog",
+        metavar="CAT",
+        help="Reference catalogue: FITS_LDAC, or any table astropy reads (Gaia column names).",
+    ),
+]
+WcsFile = Annotated[
+    str | None,
+    typer.Option(
+        "--wcs",
+        metavar="HEADER",
+        help="Starting WCS of source tables: FITS file[EXT], text header or .head file.",
+    ),
+]
+
+
+@app.command("calibrate", no_args_is_help=True)
+def calibrate_command(
+    frames: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FRAME...",
+            help="FITS images (path or path[EXT]), FITS_LDAC lists, or source tables with --wcs.",
+        ),
+    ],
+    catalog: Catalog,
+    output: Annotated[
+        Path,
+        typer.Option("--output", metavar="DIR", help="Folder for the results; made if needed."),
+    ],
+    wcs: WcsFile = None,
+    detector: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Detector of all frames; default: from the headers."),
+    ] = None,
+    solution: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Stored *.solution.asdf: fit only the attitude of each frame."
+        ),
+    ] = None,
+    update: Annotated[
+        bool, typer.Option("--update", help="Merge the frames into the stored solution.")
+    ] = False,
+    refine: Annotated[
+        str,
+        typer.Option(metavar="{auto,attitude,pv}", help="What is fitted for each exposure."),
+    ] = "auto",
+    lut: Annotated[
+        str,
+        typer.Option(
+            metavar="{auto,none}", help="Look-up table: where it helps (auto), or never (none)."
+        ),
+    ] = "auto",
+    weight: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Radial weight: exp-sqrt, gaussian, inverse, inverse-square or uniform.",
+        ),
+    ] = "exp-sqrt",
+    r0: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PX",
+            help="Radius of full weight in px; default: 0.87 x half the shorter side.",
+        ),
+    ] = None,
+    n_grid: Annotated[
+        int, typer.Option(metavar="N", help="Nodes of the look-up table along each axis.")
+    ] = 50,
+    centroids: Annotated[
+        str,
+        typer.Option(metavar="{psf,windowed,given}", help="How positions on images are measured."),
+    ] = "psf",
+    reference_point: Annotated[
+        str,
+        typer.Option(
+            metavar="{header,center,nearest-source}",
+            help="Tangent point and origin of the polynomial; the centre if off the detector.",
+        ),
+    ] = "header",
+    threshold: Annotated[
+        float,
+        typer.Option(metavar="SIGMA", help="Detection threshold over the background noise."),
+    ] = 5.0,
+    blind: Annotated[
+        bool,
+        typer.Option(
+            "--blind", help="Search flips, 90 degree turns, scale +-5 % and pointing +-1/4 frame."
+        ),
+    ] = False,
+    holdout: Annotated[
+        float,
+        typer.Option(
+            metavar="SHARE",
+            help="Share of the reference stars kept out of every fit and measured separately.",
+        ),
+    ] = 0.0,
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Seed of the choice of held-out stars.")
+    ] = 0,
+    jobs: Annotated[
+        int, typer.Option(metavar="N", help="Processes that measure and match frames.")
+    ] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", help="Address of a running Dask scheduler, instead of --jobs."
+        ),
+    ] = None,
+    report: Annotated[
+        bool, typer.Option("--report", help="Also write report.html with figures.")
+    ] = False,
+    preset: Preset = None,
+    config: Config = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+):
+    """Calibrate frames: detect, match, fit and write one WCS file each.
+
+    Writes STEM.wcs.asdf and STEM.matches.ecsv for each solved frame (and STEM.sources.ecsv for
+    images), DETECTOR.solution.asdf for each detector, and summary.ecsv.  Exit status 1 if a frame
+    was not solved: it has no WCS file, and its row of the summary says why.
+    """
+    from wpdc_gwcs.calibration import Settings, calibrate
+    from wpdc_gwcs.catalogs import read_catalog
+    from wpdc_gwcs.io import read, read_frames
+    from wpdc_gwcs.solution import DistortionSolution
+
+    if update and solution is None:
+        raise InputError("--update needs the stored solution: --solution FILE")
+    if jobs < 1:
+        raise InputError(f"--jobs must be at least 1, got {jobs}")
+    try:
+        settings = Settings(
+            weight=weight,
+            r0=r0,
+            n_grid=n_grid,
+            lut=lut,
+            refine=refine,
+            centroids=centroids,
+            reference_point=reference_point,
+            threshold=threshold,
+            blind=blind,
+            holdout=holdout,
+            seed=seed,
+        )
+    except ValueError as err:
+        raise InputError(str(err)) from err
+
+    loaded = [f for path in frames for f in read_frames(path, wcs=wcs, detector=detector)]
+    results = Results(output, loaded, overwrite=overwrite)
+    if report:
+        results.require_free("report.html")
+    reference = read_catalog(catalog)
+    stored = None
+    if solution is not None:
+        stored = read(solution)
+        if not isinstance(stored, DistortionSolution):
+            raise InputError(f"{solution}: --solution needs a *.solution.asdf file")
+    with executor(scheduler) as pool, progress_bar(quiet=quiet) as progress:
+        run = calibrate(
+            loaded,
+            reference,
+            solution=stored,
+            update=update,
+            settings=settings,
+            jobs=jobs,
+            executor=pool,
+            progress=progress,
+        )
+    results.write(run)
+    if report:
+        from wpdc_gwcs.report import write_report
+
+        write_report(output, output / "report.html")
+    if not quiet:
+        print_summary(run, output)
+    for name, error in run.failures.items():
+        log.error("%s: not solved: %s", name, error)
+    if any(isinstance(error, InputError) for error in run.failures.values()):
+        raise typer.Exit(2)
+    if run.failures:
+        raise typer.Exit(1)
+
+
+class Results:
+    """Files of one calibration: checked before the work begins, written after it."""
+
+    def __init__(self, folder, frames, *, overwrite):
+        self.folder = folder
+        self.overwrite = overwrite
+        self._check_names(frames)
+        self._make_folder()
+        for frame in frames:
+            for suffix in (".wcs.asdf", ".matches.ecsv", ".sources.ecsv"):
+                self.require_free(frame.name + suffix)
+        for detector in {frame.detector for frame in frames}:
+            self.require_free(f"{file_stem(detector)}.solution.asdf")
+        self.require_free("summary.ecsv")
+
+    @staticmethod
+    def _check_names(frames):
+        seen = {}
+        for frame in frames:
+            if frame.name in seen:
+                raise InputError(
+                    f"{frame.source} and {seen[frame.name]} would both write "
+                    f"{frame.name}.wcs.asdf: calibrate them into different folders"
+                )
+            seen[frame.name] = frame.source
+
+    def _make_folder(self):
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.folder):
+                pass
+        except OSError as err:
+            raise InputError(
+                f"{self.folder}: the output folder must be writable: {err.strerror}"
+            ) from err
+
+    def require_free(self, name):
+        """Refuse to go on if this file is there and may not be replaced."""
+        path = self.folder / name
+        if path.is_dir():
+            raise InputError(f"{path}: is a folder, and a file of this name would be written")
+        if path.exists() and not self.overwrite:
+            raise InputError(f"{path}: file exists, and is replaced only with --overwrite")
+
+    def write(self, run):
+        """Write all files; each is complete or not there."""
+        from wpdc_gwcs.io import write, write_table
+
+        for calibration in run.calibrations:
+            stem = self.folder / calibration.frame
+            if calibration.sources is not None:
+                write_table(calibration.sources, f"{stem}.sources.ecsv", overwrite=self.overwrite)
+            write_table(calibration.matches, f"{stem}.matches.ecsv", overwrite=self.overwrite)
+            write(calibration, f"{stem}.wcs.asdf", overwrite=self.overwrite)
+        for name in run.failures:
+            # What an earlier run left for a frame that now fails would pass for its WCS.
+            for suffix in (".wcs.asdf", ".matches.ecsv", ".sources.ecsv"):
+                if self.overwrite:
+                    (self.folder / f"{name}{suffix}").unlink(missing_ok=True)
+        for detector, solution in run.solutions.items():
+            write(
+                solution,
+                self.folder / f"{file_stem(detector)}.solution.asdf",
+                overwrite=self.overwrite,
+            )
+        write_table(run.summary, self.folder / "summary.ecsv", overwrite=self.overwrite)
+
+
+def file_stem(detector):
+    """File name for a detector, whatever characters its name has."""
+    return "".join(c if c.isalnum() or c in "._-" else "_" for c in detector)
+
+
+@contextmanager
+def executor(address):
+    """Executor of the Dask cluster at this address, or None."""
+    if address is None:
+        yield None
+        return
+    try:
+        from dask.distributed import Client
+    except ImportError as err:
+        raise InputError(
+            "--scheduler needs Dask, which is not installed: pip install 'wpdc_gwcs[dask]'"
+        ) from err
+    try:
+        client = Client(address, timeout="10s")
+    except (OSError, ValueError) as err:
+        raise InputError(f"--scheduler {address}: no Dask scheduler answers there: {err}") from err
+    with client:
+        yield client.get_executor()
+
+
+def print_summary(run, folder):
+    """Print a line per frame and what was written."""
+    width = max([len("frame"), *(len(name) for name in run.summary["frame"])])
+    typer.echo(
+        f"{'frame':<{width}}  status  sources  matched  sigma_dx  sigma_dy  rms_mas  seconds"
+    )
+    for row in run.summary:
+        typer.echo(
+            f"{row['frame']:<{width}}  {row['status']:<6}  {row['n_sources']:7d}  "
+            f"{row['n_matched']:7d}  "
+            f"{float(row['sigma_dx'].value):8.4f}  {float(row['sigma_dy'].value):8.4f}  "
+            f"{float(row['rms_mas'].value):7.2f}  {float(row['seconds'].value):7.2f}"
+        )
+    n = len(run.calibrations)
+    typer.echo(f"{n} of {len(run.summary)} frames solved; results in {os.fspath(folder)}")

@@ -1,0 +1,208 @@
+"""`wpdc simulate` and `wpdc demo`: frames whose distortion is known."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.calibrate import Results
+from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose
+from wpdc_gwcs.cli.progress import progress_bar
+from wpdc_gwcs.exceptions import InputError
+
+# The demo fails if the delivered WCS is further off its own truth than this, px rms.
+DEMO_LIMIT = 0.02
+
+
+@app.command("simulate", no_args_is_help=True)
+def simulate_command(
+    output: Annotated[
+        Path, typer.Option("--output", metavar="DIR", help="Folder to write to; made if needed.")
+    ],
+    exposures: Annotated[int, typer.Option(metavar="N", help="Dithered exposures.")] = 5,
+    images: Annotated[
+        int, typer.Option(metavar="N", help="How many of them are images; the rest are lists.")
+    ] = 1,
+    size: Annotated[int, typer.Option(metavar="PX", help="Side of the square detector.")] = 2048,
+    distortion: Annotated[
+        float, typer.Option(metavar="PX", help="Greatest displacement by distortion.")
+    ] = 40.0,
+    waves: Annotated[
+        float, typer.Option(metavar="PX", help="Amplitude of fine structure no cubic can take.")
+    ] = 0.0,
+    density: Annotated[float, typer.Option(metavar="N", help="Stars per square arcmin.")] = 20.0,
+    pixel_scale: Annotated[float, typer.Option(metavar="ARCSEC", help="Pixel scale.")] = 0.3,
+    seed: Annotated[int, typer.Option(metavar="N", help="Another seed, another camera.")] = 1,
+    overwrite: Overwrite = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+):
+    """Simulate exposures with a known distortion: images, FITS_LDAC lists and a reference."""
+    from astropy import units as u
+
+    from wpdc_gwcs.simulation import simulate
+
+    try:
+        simulation = simulate(
+            exposures,
+            image_shape=(size, size),
+            distortion=distortion,
+            waves=waves,
+            density=density,
+            pixel_scale=pixel_scale * u.arcsec,
+            seed=seed,
+        )
+    except ValueError as err:
+        raise InputError(str(err)) from err
+    if not 0 <= images <= exposures:
+        raise InputError(f"--images must be between 0 and {exposures}, got {images}")
+    files = write_files(simulation, output, images=range(images), overwrite=overwrite)
+    if not quiet:
+        frames = " ".join(map(str, files["frames"]))
+        typer.echo(f"wpdc calibrate {frames} --catalog {files['reference']} --output results")
+
+
+def write_files(simulation, folder, *, images, overwrite):
+    """Write a simulation, with errors that the command line can show.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        What to write.
+    folder : Path
+        Where to.
+    images : sequence of int
+        Exposures that are rendered.
+    overwrite : bool
+        Replace files.
+
+    Returns
+    -------
+    dict
+        See `wpdc_gwcs.simulation.write_simulation`.
+    """
+    from wpdc_gwcs.simulation import write_simulation
+
+    try:
+        return write_simulation(
+            simulation, folder, images=images, sources="ldac", overwrite=overwrite
+        )
+    except FileExistsError as err:
+        raise InputError(f"{err}: replaced only with --overwrite") from err
+
+
+@app.command("demo")
+def demo_command(
+    output: Annotated[
+        Path, typer.Option("--output", metavar="DIR", help="Folder to write to; made if needed.")
+    ] = Path("wpdc-demo"),
+    seed: Annotated[int, typer.Option(metavar="N", help="Another seed, another camera.")] = 1,
+    overwrite: Overwrite = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+):
+    """Simulate five exposures of a camera with 40 px of distortion, calibrate them, show the truth.
+
+    One exposure is an image, four are source lists.  All inputs, results and pictures are kept in
+    the output folder.  Exit status 1 if the WCS is off its own truth by more than 0.02 px rms.
+    """
+    from wpdc_gwcs.calibration import calibrate
+    from wpdc_gwcs.catalogs import read_catalog
+    from wpdc_gwcs.io import read_frames
+    from wpdc_gwcs.simulation import simulate
+
+    began = time.perf_counter()
+    simulation = simulate(5, distortion=40.0, seed=seed)
+    files = write_files(simulation, output / "input", images=(0,), overwrite=overwrite)
+    frames = [frame for path in files["frames"] for frame in read_frames(path)]
+    results = Results(output, frames, overwrite=overwrite)
+    with progress_bar(quiet=quiet) as progress:
+        run = calibrate(frames, read_catalog(files["reference"]), progress=progress)
+    results.write(run)
+    for name, error in run.failures.items():
+        typer.echo(f"wpdc: error: {name}: not solved: {error}", err=True)
+    solved = {calibration.frame: calibration for calibration in run.calibrations}
+    truth = [e for e in simulation.exposures if e.name in solved]
+    errors = [e.wcs_error(solved[e.name].wcs) for e in truth]
+    if errors:
+        draw_demo(truth[0], solved[truth[0].name], errors[0], output / "pictures")
+    seconds = time.perf_counter() - began
+    worst = max((float(np.sqrt(np.mean(e[2] ** 2 + e[3] ** 2))) for e in errors), default=np.inf)
+    if not quiet:
+        print_demo(simulation, solved, errors, output, seconds)
+    if run.failures or not worst <= DEMO_LIMIT:
+        raise typer.Exit(1)
+
+
+def draw_demo(exposure, calibration, error, folder):
+    """Draw the pictures of the demo: before and after, residuals, look-up table.
+
+    Parameters
+    ----------
+    exposure : SimulatedExposure
+        The exposure, with its truth.
+    calibration : Calibration
+        What was found of it.
+    error : tuple of ndarray
+        Grid positions and error of the calibrated WCS, px.
+    folder : Path
+        Where the pictures go.
+    """
+    from wpdc_gwcs import plotting
+
+    folder.mkdir(exist_ok=True)
+    shape = exposure.image_shape
+    table = calibration.solution.lookup_table
+    figures = {
+        "before.png": plotting.plot_residual_arrows(
+            *exposure.wcs_error(exposure.wcs), image_shape=shape, title="Header: error of the WCS"
+        ),
+        "after.png": plotting.plot_residual_arrows(
+            *error, image_shape=shape, title="Calibrated: error of the WCS"
+        ),
+        "residuals.png": plotting.plot_residuals_vs_position(calibration.matches),
+    }
+    if table is not None:
+        figures["lookup_table.png"] = plotting.plot_lookup_table(table)
+    for name, figure in figures.items():
+        figure.savefig(folder / name, dpi=110)
+
+
+def print_demo(simulation, solved, errors, output, seconds):
+    """Print the error of each exposure against its truth, before and after.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        The exposures with their truth.
+    solved : dict
+        Exposure name to calibration.
+    errors : list of tuple
+        Grid error of each solved exposure.
+    output : Path
+        Where the results are.
+    seconds : float
+        How long it took.
+    """
+    typer.echo("                stars           error of the WCS against the truth [px]")
+    typer.echo("exposure      matched   header rms   calibrated rms     90 %      max")
+    remaining = iter(errors)
+    for exposure in simulation.exposures:
+        before = np.hypot(*exposure.wcs_error(exposure.wcs)[2:])
+        line = f"{exposure.name:<12}"
+        if exposure.name not in solved:
+            typer.echo(f"{line}  not solved")
+            continue
+        after = np.hypot(*next(remaining)[2:])
+        typer.echo(
+            f"{line} {solved[exposure.name].statistics['n_matched']:8d} "
+            f"{np.sqrt(np.mean(before**2)):12.3f} {np.sqrt(np.mean(after**2)):16.4f} "
+            f"{np.percentile(after, 90):8.4f} {after.max():8.4f}"
+        )
+    if errors:
+        total = np.concatenate([np.hypot(*e[2:]) for e in errors])
+        typer.echo(f"All exposures: {np.sqrt(np.mean(total**2)):.4f} px rms off the truth")
+    typer.echo(f"{seconds:.1f} s; WCS files, tables and pictures are in {output}")

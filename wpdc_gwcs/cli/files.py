@@ -1,0 +1,223 @@
+"""Commands on files that are there: `export`, `pix2sky`, `sky2pix`, `evaluate`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose
+from wpdc_gwcs.exceptions import InputError
+
+FORMATS = ("fits", "cpdis", "head", "sip", "stock")
+
+CalibrationFile = Annotated[
+    Path,
+    typer.Argument(metavar="FILE", help="A *.wcs.asdf, *.solution.asdf or exported FITS file."),
+]
+Origin = Annotated[
+    int,
+    typer.Option(metavar="{0,1}", help="Pixel coordinate of the centre of the first pixel."),
+]
+Output = Annotated[
+    Path | None,
+    typer.Option("--output", metavar="FILE", help="Write the table here instead of printing it."),
+]
+
+
+@app.command("export", no_args_is_help=True)
+def export_command(
+    file: CalibrationFile,
+    format: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="{fits,cpdis,head,sip,stock}",
+            help="fits: TPV + table, exact; cpdis: for astropy.wcs; head: for SWarp, SCAMP; "
+            "sip: for DS9; stock: gwcs alone.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", metavar="OUT", help="File to write.")],
+    overwrite: Overwrite = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+):
+    """Write a calibrated WCS in a format that other programs read; say how far it deviates."""
+    from wpdc_gwcs.io import read, write
+
+    if format not in FORMATS:
+        raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
+    if output.exists() and not overwrite:
+        raise InputError(f"{output}: file exists, and is replaced only with --overwrite")
+    deviation = write(read(file), output, format=format, overwrite=overwrite)
+    if not quiet:
+        note = "" if deviation is None else f" (greatest deviation {deviation:.2g} px)"
+        typer.echo(f"{output}: written as {format}{note}")
+
+
+@app.command("pix2sky", no_args_is_help=True, context_settings={"ignore_unknown_options": True})
+def pix2sky_command(
+    file: CalibrationFile,
+    points: Annotated[
+        list[str],
+        typer.Argument(metavar="X Y | TABLE", help="Pixel position, or a table with x, y."),
+    ],
+    origin: Origin = 0,
+    output: Output = None,
+    overwrite: Overwrite = False,
+):
+    """Pixel to sky: prints RA and Dec (ICRS, deg); a table gets the columns ra and dec."""
+    _transform(file, points, origin, output, overwrite, forward=True)
+
+
+@app.command("sky2pix", no_args_is_help=True, context_settings={"ignore_unknown_options": True})
+def sky2pix_command(
+    file: CalibrationFile,
+    points: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RA DEC | TABLE", help="ICRS position in deg, or a table with ra, dec."
+        ),
+    ],
+    origin: Origin = 0,
+    output: Output = None,
+    overwrite: Overwrite = False,
+):
+    """Sky to pixel: prints x and y; a table gets the columns x and y.  Off the detector: nan."""
+    _transform(file, points, origin, output, overwrite, forward=False)
+
+
+def _transform(file, points, origin, output, overwrite, *, forward):
+    from wpdc_gwcs.io import read
+
+    if origin not in (0, 1):
+        raise InputError(f"--origin must be 0 or 1, got {origin}")
+    wcs = read(file).wcs
+    names = ("x", "y", "ra", "dec") if forward else ("ra", "dec", "x", "y")
+
+    def transform(a, b):
+        if forward:
+            return wcs(a - origin, b - origin)
+        x, y = wcs.invert(a, b)
+        return x + origin, y + origin
+
+    if len(points) == 1:
+        _transform_table(points[0], names, transform, output, overwrite)
+        return
+    a, b = _numbers(points, names[:2])
+    result = [float(value) for value in transform(a, b)]
+    if not np.all(np.isfinite(result)):
+        where = "detector" if forward else "sky of the detector"
+        typer.echo("nan nan")
+        typer.echo(f"wpdc: error: {' '.join(points)} is outside the {where}", err=True)
+        raise typer.Exit(1)
+    digits = 10 if forward else 5
+    typer.echo(" ".join(f"{value:.{digits}f}" for value in result))
+
+
+def _numbers(points, names):
+    if len(points) != 2:
+        raise InputError(
+            f"give {names[0]} and {names[1]}, or one table; got {len(points)} values: "
+            f"{' '.join(points)}"
+        )
+    try:
+        return [np.float64(p) for p in points]
+    except ValueError as err:
+        raise InputError(
+            f"{names[0]} and {names[1]} must be numbers, got {' '.join(points)}"
+        ) from err
+
+
+def _transform_table(path, names, transform, output, overwrite):
+    from wpdc_gwcs.io import read_table, write_table
+
+    table = read_table(path, columns=names[:2])
+    a, b = (np.asarray(table[name], float) for name in names[:2])
+    c, d = transform(a, b)
+    unit = "deg" if names[2] == "ra" else "pix"
+    for name, values in zip(names[2:], (c, d), strict=True):
+        table[name] = values
+        table[name].unit = unit
+    if output is None:
+        table.write(typer.get_text_stream("stdout"), format="ascii.ecsv")
+    else:
+        write_table(table, output, overwrite=overwrite)
+
+
+@app.command("evaluate", no_args_is_help=True)
+def evaluate_command(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="PATH...", help="*.matches.ecsv files, *.wcs.asdf files, or result folders."
+        ),
+    ],
+    output: Output = None,
+    plots: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Also write figures of the residuals into this folder."),
+    ] = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+):
+    """Residuals of calibrated frames: clipped moments, d80, scatter; held-out stars apart."""
+    from astropy.table import QTable
+
+    from wpdc_gwcs.evaluation import evaluate
+    from wpdc_gwcs.io import read_matches, write_table
+
+    rows = []
+    for path in match_files(paths):
+        matches = read_matches(path)
+        held = np.asarray(matches["holdout"], bool)
+        for stars, mask in (("used", np.asarray(matches["used"], bool)), ("holdout", held)):
+            if mask.any():
+                s = evaluate(np.asarray(matches["dx"])[mask], np.asarray(matches["dy"])[mask])
+                rows.append(
+                    dict(frame=path.name.removesuffix(".matches.ecsv"), stars=stars, **vars(s))
+                )
+        if plots is not None:
+            _write_plots(matches, path, plots, overwrite=overwrite)
+    table = QTable(rows)
+    if output is not None:
+        write_table(table, output, overwrite=overwrite)
+    if not quiet and output is None:
+        for name in table.colnames[4:]:
+            table[name].info.format = ".4f"
+        for line in table.pformat(max_lines=-1, max_width=-1, align=["<", "<"] + [">"] * 11):
+            typer.echo(line)
+
+
+def match_files(paths):
+    """Match tables behind files and folders, in order.
+
+    Parameters
+    ----------
+    paths : list of Path
+        Match tables, WCS files with their match tables beside them, or folders of these.
+
+    Returns
+    -------
+    list of Path
+        Paths of match tables, all there.
+    """
+    found = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(path.glob("*.matches.ecsv"))
+            if not inside:
+                raise InputError(f"{path}: the folder has no *.matches.ecsv file")
+            found += inside
+            continue
+        if path.name.endswith(".wcs.asdf"):
+            path = path.with_name(path.name.removesuffix(".wcs.asdf") + ".matches.ecsv")
+        if not path.exists():
+            raise InputError(f"{path}: no such file")
+        found.append(path)
+    return found
+
+
+def _write_plots(matches, path, folder, *, overwrite): ...

@@ -1,0 +1,117 @@
+"""Options that several commands share, and the files and presets they may come from."""
+
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from wpdc_gwcs.cli.app import set_verbosity
+from wpdc_gwcs.exceptions import InputError
+
+__all__ = ["Config", "Overwrite", "Preset", "Quiet", "Verbose"]
+
+
+def preset_names():
+    """Names of the presets that come with the package.
+
+    Returns
+    -------
+    list of str
+        Sorted names.
+    """
+    folder = files("wpdc_gwcs") / "presets"
+    return sorted(
+        p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml")
+    )
+
+
+def _as_defaults(ctx, text, where):
+    """Make the options in a TOML text the defaults of the command; what is typed still wins."""
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as err:
+        raise InputError(f"{where}: not valid TOML: {err}") from err
+    known = {p.name: p for p in ctx.command.params}
+    defaults = dict(ctx.default_map or {})
+    for key, value in values.items():
+        name = key.replace("-", "_")
+        if name not in known or name in ("frames", "config", "preset"):
+            raise InputError(f"{where}: unknown option {key!r}; see '{ctx.command_path} --help'")
+        if isinstance(value, dict):
+            raise InputError(f"{where}: option {key!r} must be a single value, got a table")
+        defaults[name] = value
+    ctx.default_map = defaults
+
+
+def _load_preset(ctx: typer.Context, name: str | None):
+    if name is None or ctx.resilient_parsing:
+        return name
+    if name not in preset_names():
+        raise typer.BadParameter(
+            f"unknown preset {name!r}: must be one of {', '.join(preset_names())}", ctx=ctx
+        )
+    text = (files("wpdc_gwcs") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
+    # A configuration file read before it on the command line still wins over the preset.
+    typed = dict(ctx.default_map or {})
+    _as_defaults(ctx, text, f"preset {name}")
+    ctx.default_map = {**ctx.default_map, **typed}
+    return name
+
+
+def _load_config(ctx: typer.Context, path: Path | None):
+    if path is None or ctx.resilient_parsing:
+        return path
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as err:
+        raise InputError(f"{path}: no such configuration file") from err
+    except (OSError, UnicodeDecodeError) as err:
+        raise InputError(f"{path}: cannot read the configuration file: {err}") from err
+    _as_defaults(ctx, text, str(path))
+    return path
+
+
+def _verbose(ctx: typer.Context, value: int):
+    ctx.meta["wpdc.verbose"] = value
+    set_verbosity(value, quiet=ctx.meta.get("wpdc.quiet", False))
+    return value
+
+
+def _quiet(ctx: typer.Context, value: bool):
+    ctx.meta["wpdc.quiet"] = value
+    set_verbosity(ctx.meta.get("wpdc.verbose", 0), quiet=value)
+    return value
+
+
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help=f"Options for a known camera: {', '.join(preset_names())}.",
+        callback=_load_preset,
+        is_eager=True,
+    ),
+]
+Config = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE.toml",
+        help="Options from a TOML file (keys as on the command line); typed options win.",
+        callback=_load_config,
+        is_eager=True,
+    ),
+]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace files that are already there.")
+]
+Verbose = Annotated[
+    int,
+    typer.Option(
+        "-v", "--verbose", count=True, help="Say what happens (-vv: more).", callback=_verbose
+    ),
+]
+Quiet = Annotated[
+    bool, typer.Option("-q", "--quiet", help="Say nothing but errors.", callback=_quiet)
+]

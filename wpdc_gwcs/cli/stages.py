@@ -1,0 +1,126 @@
+"""Single stages from the shell: `detect` and `match`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.calibrate import Catalog, WcsFile
+from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose
+from wpdc_gwcs.exceptions import InputError
+
+Table = Annotated[Path, typer.Option("--output", metavar="FILE", help="Table to write (ECSV).")]
+
+
+def one_frame(path, *, wcs=None):
+    """Read the single frame of a file.
+
+    Parameters
+    ----------
+    path : str
+        FITS image or source list; ``path[EXT]`` chooses an extension.
+    wcs : str, optional
+        Starting WCS of a source table.
+
+    Returns
+    -------
+    Frame
+        The frame.
+    """
+    from wpdc_gwcs.io import read_frames
+
+    frames = read_frames(path, wcs=wcs)
+    if len(frames) > 1:
+        names = ", ".join(frame.source for frame in frames)
+        raise InputError(f"{path}: has {len(frames)} frames, choose one with path[EXT]: {names}")
+    return frames[0]
+
+
+@app.command("detect", no_args_is_help=True)
+def detect_command(
+    frame: Annotated[str, typer.Argument(metavar="IMAGE", help="FITS image, path or path[EXT].")],
+    output: Table,
+    centroids: Annotated[
+        str, typer.Option(metavar="{psf,windowed}", help="How positions are measured.")
+    ] = "psf",
+    threshold: Annotated[
+        float, typer.Option(metavar="SIGMA", help="Detection threshold over the background noise.")
+    ] = 5.0,
+    overwrite: Overwrite = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+):
+    """Detect the stars of an image and measure their positions."""
+    from wpdc_gwcs.calibration import Settings, measure_sources
+    from wpdc_gwcs.io import write_table
+
+    require_free(output, overwrite)
+    try:
+        settings = Settings(centroids=centroids, threshold=threshold)
+    except ValueError as err:
+        raise InputError(str(err)) from err
+    sources = measure_sources(one_frame(frame), settings)
+    write_table(sources, output, overwrite=overwrite)
+    if not quiet:
+        clean = int((sources["flags"] == 0).sum())
+        typer.echo(f"{output}: {len(sources)} sources, {clean} of them without flags")
+
+
+@app.command("match", no_args_is_help=True)
+def match_command(
+    frame: Annotated[
+        str,
+        typer.Argument(metavar="FRAME", help="FITS image, FITS_LDAC list, or table with --wcs."),
+    ],
+    catalog: Catalog,
+    output: Table,
+    wcs: WcsFile = None,
+    blind: Annotated[
+        bool,
+        typer.Option(
+            "--blind", help="Search flips, 90 degree turns, scale +-5 % and pointing +-1/4 frame."
+        ),
+    ] = False,
+    overwrite: Overwrite = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+):
+    """Match the sources of a frame to a catalogue; exit status 1 without enough evidence."""
+    import numpy as np
+    from astropy.table import QTable
+
+    from wpdc_gwcs.calibration import Settings, match_frame
+    from wpdc_gwcs.catalogs import read_catalog
+    from wpdc_gwcs.io import write_table
+
+    require_free(output, overwrite)
+    matched = match_frame(one_frame(frame, wcs=wcs), read_catalog(catalog), Settings(blind=blind))
+    i_src, i_ref = matched.pairs
+    table = QTable(
+        {
+            "source_index": i_src,
+            "catalog_index": np.asarray(matched.reference["catalog_index"])[i_ref],
+            "x": np.asarray(matched.sources["x"], float)[i_src],
+            "y": np.asarray(matched.sources["y"], float)[i_src],
+            "ra": np.asarray(matched.reference["ra"], float)[i_ref],
+            "dec": np.asarray(matched.reference["dec"], float)[i_ref],
+        }
+    )
+    write_table(table, output, overwrite=overwrite)
+    if not quiet:
+        typer.echo(f"{output}: {len(table)} pairs; {matched.diagnostics}")
+
+
+def require_free(path, overwrite):
+    """Refuse to go on if this file is there and may not be replaced.
+
+    Parameters
+    ----------
+    path : Path
+        File that will be written.
+    overwrite : bool
+        Whether it may be replaced.
+    """
+    if path.exists() and not overwrite:
+        raise InputError(f"{path}: file exists, and is replaced only with --overwrite")
