@@ -272,20 +272,20 @@ def _reduced_normal(field, profile, noise, stars, modes, radius):
     """Set up normal equations (N, K, K), (N, K) for modes, free of position and flux."""
     half = int(np.ceil(radius))
     xc, yc, pixels, use, sky = field.cut(stars, half, radius)
-    weights = profile.node_weights(stars.x, stars.y)
-    basis = profile.evaluate(stars.x - xc, stars.y - yc, half, weights)
+    shares = profile.shares(stars.x, stars.y)
+    basis = profile.evaluate(stars.x - xc, stars.y - yc, half, shares)
     flux = stars.flux[:, None]
     model = flux * basis[0]
     residual = pixels - model
     weight = use / noise.variance(sky, model)
     weight *= np.minimum(1, _HUBER / np.maximum(np.abs(residual) * np.sqrt(weight), 1e-9))
-    zero = np.zeros(1)
+    zero, one = np.zeros(1), np.ones((len(flux), 1))
     common = [
-        flux
-        * Profile(mode.reshape(1, *mode.shape[-2:]), profile.oversampling, zero, zero).evaluate(
-            stars.x - xc, stars.y - yc, half, gradient=False
-        )[0]
-        for mode in modes
+        flux * shape.evaluate(stars.x - xc, stars.y - yc, half, one, gradient=False)[0]
+        for shape in (
+            Profile(mode.reshape(1, *mode.shape[-2:]), profile.oversampling, zero, zero)
+            for mode in modes
+        )
     ]
     own = np.stack([flux * basis[1], flux * basis[2], basis[0]], axis=1)
     common = np.stack(common, axis=1)
@@ -303,8 +303,8 @@ def _residual_coefficients(field, noise, profile, stars, fwhm):
     half = profile.radius - 1
     xc, yc, pixels, use, sky = field.cut(stars, half, np.inf)
     x, y, flux = stars
-    weights = profile.node_weights(x, y)
-    model = flux[:, None] * profile.evaluate(x - xc, y - yc, half, weights, gradient=False)[0]
+    shares = profile.shares(x, y)
+    model = flux[:, None] * profile.evaluate(x - xc, y - yc, half, shares, gradient=False)[0]
     residual = pixels - model
     weight = use / noise.variance(sky, model)
     weight *= np.minimum(1, _HUBER / np.maximum(np.abs(residual) * np.sqrt(weight), 1e-9)) ** 2

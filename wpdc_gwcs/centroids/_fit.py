@@ -23,6 +23,9 @@ __all__ = [
 # Stars fitted at a time: bounds the memory for their pixels.
 _CHUNK = 4000
 
+# Error of the profile below which nobody's data can tell.
+_MIN_MISMATCH = 0.003
+
 _MAX_STEP = 0.5  # px per iteration
 _MAX_ITERATIONS = 12
 _CONVERGED = 3e-5  # px
@@ -172,18 +175,19 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
     half = int(np.ceil(radius))
     xc, yc, pixels, use, sky = field.cut(stars, half, radius)
     if own is not None:
-        weights = profile.node_weights(own.x, own.y)
-        model = profile.evaluate(own.x - xc, own.y - yc, half, weights, gradient=False)[0]
+        shares = profile.shares(own.x, own.y)
+        model = profile.evaluate(own.x - xc, own.y - yc, half, shares, gradient=False)[0]
         pixels += own.flux[:, None] * model
     x, y, flux = (np.array(v, dtype=float) for v in stars)
-    weights = profile.node_weights(x, y) if len(profile.coefficients) > 1 else None
+    shares = profile.shares(x, y)
     flux = np.maximum(flux, 1e-6)
     x0, y0 = x.copy(), y.copy()
     converged = np.zeros(len(x), bool)
     active = np.arange(len(x))
     for _ in range(_MAX_ITERATIONS):
-        w = None if weights is None else weights[active]
-        basis = profile.evaluate(x[active] - xc[active], y[active] - yc[active], half, w)
+        basis = profile.evaluate(
+            x[active] - xc[active], y[active] - yc[active], half, shares[active]
+        )
         step, *_rest = _normal_step(
             basis, flux[active], pixels[active], use[active], sky[active], noise
         )
@@ -203,7 +207,7 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
     else:
         # Slow but close enough: what is left is far below the error.
         converged[active] = np.abs(shift[~done & ~away]).max(axis=1, initial=0) < 3e-3
-    basis = profile.evaluate(x - xc, y - yc, half, weights)
+    basis = profile.evaluate(x - xc, y - yc, half, shares)
     _step, covariance, chi2 = _normal_step(basis, flux, pixels, use, sky, noise)
     positive = np.einsum("sii->si", covariance).min(axis=1, initial=np.inf) > 0
     valid = converged & positive & np.isfinite(chi2)
@@ -272,8 +276,8 @@ def render(shape, profile, stars, *, faintest=0.0):
         for start in range(0, len(rows), size):
             k = rows[start : start + size]
             xc, yc = np.rint(x[k]).astype(int), np.rint(y[k]).astype(int)
-            weights = profile.node_weights(x[k], y[k])
-            model = profile.evaluate(x[k] - xc, y[k] - yc, half, weights, gradient=False)[0]
+            shares = profile.shares(x[k], y[k])
+            model = profile.evaluate(x[k] - xc, y[k] - yc, half, shares, gradient=False)[0]
             step = np.arange(-half, half + 1)
             iy, ix = yc[:, None] + step, xc[:, None] + step
             inside = ((iy >= 0) & (iy < shape[0]))[:, :, None]
@@ -331,8 +335,8 @@ def estimate_noise(field, profile, noise, stars, *, radius, gain=None):
     """
     half = int(np.ceil(radius))
     xc, yc, pixels, use, sky = field.cut(stars, half, radius)
-    weights = profile.node_weights(stars.x, stars.y)
-    basis = profile.evaluate(stars.x - xc, stars.y - yc, half, weights)
+    shares = profile.shares(stars.x, stars.y)
+    basis = profile.evaluate(stars.x - xc, stars.y - yc, half, shares)
     flux = stars.flux
     model = flux[:, None] * basis[0]
     use &= model > np.sqrt(sky)
@@ -365,7 +369,10 @@ def estimate_noise(field, profile, noise, stars, *, radius, gain=None):
     logs = least_squares(
         lambda logs: np.log(measured / variance(logs)),
         start,
-        bounds=([np.log(1e-4)] + [-30] * (gain is None), [np.log(0.5)] + [30] * (gain is None)),
+        bounds=(
+            [np.log(_MIN_MISMATCH)] + [-30] * (gain is None),
+            [np.log(0.5)] + [30] * (gain is None),
+        ),
         loss="soft_l1",
         f_scale=0.2,
     ).x

@@ -241,7 +241,7 @@ def _fitted_table(sources, fits, good, flags):
 
 
 def _flags_and_shape(sources):
-    """Flags, and whether the sources are round enough for stars; all good if there is no column."""
+    """Read the flags, and whether sources are round enough for stars; good without the columns."""
     n = len(sources)
     flags = (
         np.array(sources["flags"], dtype=int) if "flags" in sources.colnames else np.zeros(n, int)

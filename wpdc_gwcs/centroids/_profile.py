@@ -1,6 +1,7 @@
 """PSF profiles as cubic B-splines on an oversampled grid, evaluated for many stars at once."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import spline_filter, uniform_filter1d
@@ -55,12 +56,40 @@ class Profile:
         c = (c[:, :-2] + 4 * c[:, 1:-1] + c[:, 2:]) / 6
         return (c[:, :, :-2] + 4 * c[:, :, 1:-1] + c[:, :, 2:]) / 6
 
-    def node_weights(self, x, y):
-        """Weights (N, G) of the places for stars at x, y: bilinear, constant beyond the rim."""
-        wx, wy = _hat(x, self.x_nodes), _hat(y, self.y_nodes)
-        return (wy[:, :, None] * wx[:, None, :]).reshape(len(x), -1)
+    @cached_property
+    def _components(self):
+        """Few grids of coefficients, and their shares (G, R) in those of all places.
 
-    def evaluate(self, dx, dy, half, weights=None, *, gradient=True):
+        Neighbouring places differ by a handful of shapes: with these, a star costs the same
+        however many places there are.
+        """
+        n = len(self.coefficients)
+        flat = self.coefficients.reshape(n, -1)
+        if n == 1:
+            return self.coefficients, np.ones((1, 1))
+        left, sizes, right = np.linalg.svd(flat, full_matrices=False)
+        keep = sizes > 1e-5 * sizes[0]
+        shares = left[:, keep] * sizes[keep]
+        return right[keep].reshape(-1, *self.coefficients.shape[1:]), shares
+
+    def shares(self, x, y):
+        """Shares (N, R) of the component grids for stars at x, y.
+
+        Parameters
+        ----------
+        x, y : (N,) ndarray
+            Positions in px; between places the profile is interpolated linearly, beyond them it
+            is that of the rim.
+
+        Returns
+        -------
+        (N, R) ndarray
+            Shares.
+        """
+        wx, wy = _hat(x, self.x_nodes), _hat(y, self.y_nodes)
+        return (wy[:, :, None] * wx[:, None, :]).reshape(len(x), -1) @ self._components[1]
+
+    def evaluate(self, dx, dy, half, shares, *, gradient=True):
         """Profile of each star in the pixels of its cut-out.
 
         Parameters
@@ -69,8 +98,8 @@ class Profile:
             Position of the star relative to the central pixel of its cut-out.
         half : int
             The cut-outs are 2 half + 1 px wide.
-        weights : (N, G) ndarray, optional
-            Weights of the places, see `node_weights`; may be left out for a constant profile.
+        shares : (N, R) ndarray
+            See `shares`.
         gradient : bool, optional
             Whether to return the derivatives by the position too.
 
@@ -85,32 +114,26 @@ class Profile:
         if gradient:
             outer.append(-self.oversampling * taps_y[:, :, None] * slopes_x[:, None, :])
             outer.append(-self.oversampling * slopes_y[:, :, None] * taps_x[:, None, :])
-        outer = np.stack(outer).reshape(len(outer), len(dx), 16)
-        result = np.zeros((len(outer), len(dx), (2 * half + 1) ** 2))
+        outer = np.stack(outer).reshape(len(outer), len(dx), 1, 16) * shares[:, :, None]
+        outer = outer.reshape(len(outer), len(dx), -1)
+        result = np.empty((len(outer), len(dx), (2 * half + 1) ** 2))
+        grids = self._components[0]
         margin = self.oversampling * (half + 3) + 4
-        padded = np.pad(self.coefficients, ((0, 0), (margin, margin), (margin, margin)))
+        padded = np.pad(grids, ((0, 0), (margin, margin), (margin, margin)))
         # Stars that ran far away see nothing but the padding.
         limit = margin - self.oversampling * half - 4
-        lowest, highest = -limit, self.coefficients.shape[-1] + limit
+        lowest, highest = -limit, grids.shape[-1] + limit
         base_x, base_y = np.clip(base_x, lowest, highest), np.clip(base_y, lowest, highest)
         cell = base_y * 10_000 + base_x
         order = np.argsort(cell, kind="stable")
         starts = np.flatnonzero(np.diff(cell[order], prepend=cell[order[:1]] - 1))
-        step = self.oversampling * np.arange(-half, half + 1)
+        step = margin + self.oversampling * np.arange(-half, half + 1)
+        tap = np.arange(-1, 3)[:, None]
         for rows in np.split(order, starts[1:]) if len(order) else ():
-            iy = base_y[rows[0]] + margin + np.arange(-1, 3)[:, None] + step
-            ix = base_x[rows[0]] + margin + np.arange(-1, 3)[:, None] + step
-            for g, grid in enumerate(padded):
-                if weights is None:
-                    pick, factor = rows, None
-                else:
-                    pick = rows[weights[rows, g] > 0]
-                    factor = weights[pick, g][:, None]
-                if len(pick) == 0:
-                    continue
-                table = grid[iy[:, None, :, None], ix[None, :, None, :]].reshape(16, -1)
-                part = outer[:, pick] if factor is None else outer[:, pick] * factor
-                result[:, pick] += part @ table
+            iy = base_y[rows[0]] + tap + step
+            ix = base_x[rows[0]] + tap + step
+            table = padded[:, iy[:, None, :, None], ix[None, :, None, :]]
+            result[:, rows] = outer[:, rows] @ table.reshape(outer.shape[-1], -1)
         return result
 
     @property
