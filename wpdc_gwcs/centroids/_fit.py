@@ -40,11 +40,14 @@ class Noise:
     inverse_gain : float
         Counts per electron.
     mismatch : float
-        Error of the profile in every pixel, relative to its value.
+        Error of the profile at its peak, relative to its value there.
 
     Notes
     -----
-    :math:`\sigma^2 = \sigma_\mathrm{sky}^2 + m / g + (\epsilon m)^2` with m the model's counts.
+    :math:`\sigma^2 = \sigma_\mathrm{sky}^2 + m / g + \epsilon^2 m m_\mathrm{peak}` with m the
+    model's counts.  The error of the profile has the form of photon noise, so that the brightest
+    stars are fitted with the same relative weights as those with photon noise alone; the same
+    relative error everywhere would shift them by whatever asymmetry the wings have.
     """
 
     inverse_gain: float = 0.0
@@ -53,7 +56,8 @@ class Noise:
     def variance(self, sky_variance, model):
         """Variance for pixels of given background variance and model counts."""
         model = np.maximum(model, 0)
-        return sky_variance + model * self.inverse_gain + (self.mismatch * model) ** 2
+        peak = model.max(axis=-1, keepdims=True)
+        return sky_variance + model * (self.inverse_gain + self.mismatch**2 * peak)
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,17 +355,18 @@ def estimate_noise(field, profile, noise, stars, *, radius, gain=None):
     if np.count_nonzero(use) < 50:
         return replace(noise, inverse_gain=0.0 if gain is None else 1 / gain)
     residual2 = ((pixels - model) ** 2)[use] / (1 - leverage[use])
+    square = (model * model.max(axis=1, keepdims=True))[use]
     model, sky = model[use], sky[use]
-    order = np.argsort(model)
+    order = np.argsort(square)
     bins = np.array_split(order, int(np.clip(len(order) // 50, 1, 40)))
     # 1.4826 MAD squared = median of the squares / 0.4549
     measured = np.array([np.median(residual2[b]) for b in bins]) / 0.4549 + 1e-30
-    m, s = (np.array([np.mean(v[b]) for b in bins]) for v in (model, sky))
+    m, s, q = (np.array([np.mean(v[b]) for b in bins]) for v in (model, sky, square))
     known = s if gain is None else s + m / gain
 
     def variance(logs):
         photons = m * np.exp(logs[1]) if gain is None else 0.0
-        return known + photons + np.exp(2 * logs[0]) * m**2
+        return known + photons + np.exp(2 * logs[0]) * q
 
     # Ratios, not differences: a variance is uncertain in proportion to itself; and robustly, for
     # galaxies among the stars.
