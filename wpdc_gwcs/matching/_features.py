@@ -27,6 +27,8 @@ __all__ = [
 BOX_WIDTHS = (0.02, 0.04, 0.08)
 # An agreement this surprising (decimal logarithm) makes a hypothesis member of a group.
 _LEAST_WORTH = 1.0
+# Neighbours that must coincide for a hypothesis.
+_LEAST_COUNT = 3
 # Differences held in memory at a time.
 _CHUNK = 6_000_000
 N_NEIGHBOURS = 12
@@ -220,54 +222,53 @@ def compare_patterns(
 def _coincidences(log_s, angle_s, log_r, angle_r, max_log_scale, max_rotation):
     """Best common shift in (log d, theta) of patterns (P, ks) against (P, kr)."""
     n = len(log_s)
-    difference = log_r[:, None, :] - log_s[:, :, None]
-    pair, ks, kr = np.nonzero(np.abs(difference) <= max_log_scale)
-    d_log = difference[pair, ks, kr]
+    pair, ks, kr = np.nonzero(np.abs(log_r[:, None, :] - log_s[:, :, None]) <= max_log_scale)
     d_angle = angle_r[pair, kr] - angle_s[pair, ks]
     d_angle -= np.float32(2 * np.pi) * np.rint(d_angle / np.float32(2 * np.pi))
     near = np.abs(d_angle) <= max_rotation
-    pair, d_log, d_angle = pair[near], d_log[near].astype(float), d_angle[near].astype(float)
+    pair, ks, kr, d_angle = pair[near], ks[near], kr[near], d_angle[near]
+    d_log = log_r[pair, kr] - log_s[pair, ks]
     in_range = np.bincount(pair, minlength=n)
-    best = [np.zeros(n) for _ in range(6)]
+    surprise = np.zeros(n)
+    center, half, expected = np.zeros((2, n)), np.zeros(n), np.zeros(n)
     for width in BOX_WIDTHS:
         if width > 2 * max(max_log_scale, max_rotation):
             continue
-        n_log = int(2 * max_log_scale / width) + 3
-        n_angle = int(2 * max_rotation / width) + 3
         share = min(1.0, width**2 / (4 * max_log_scale * max_rotation))
-        for half_log in (0.0, 0.5):
-            for half_angle in (0.0, 0.5):
-                cell = np.floor((d_log + max_log_scale) / width + half_log).astype(int)
-                cell = cell * n_angle + np.floor(
-                    (d_angle + max_rotation) / width + half_angle
-                ).astype(int)
-                key, inverse, count = np.unique(
-                    pair * (n_log * n_angle) + cell, return_inverse=True, return_counts=True
-                )
-                if len(key) == 0:
-                    continue
-                owner = key // (n_log * n_angle)
-                expected = np.maximum((in_range[owner] - count) * share, 1e-3)
-                probability = gammainc(count, expected)
-                surprise = -np.log10(np.maximum(probability, 1e-300))
-                surprise[count < 3] = 0.0
-                order = np.lexsort((-surprise, owner))
-                winner = order[np.concatenate([[True], owner[order][1:] != owner[order][:-1]])]
-                winner = winner[surprise[winner] > best[4][owner[winner]]]
-                where = owner[winner]
-                sums = [
-                    np.bincount(inverse, weights=w, minlength=len(key))[winner]
-                    for w in (d_log, d_angle)
-                ]
-                values = (
-                    sums[0] / count[winner],
-                    sums[1] / count[winner],
-                    count[winner],
-                    expected[winner],
-                )
-                for target, value in zip(best, (*values, surprise[winner], width), strict=True):
-                    target[where] = value
-    return best
+        n_angle = int(2 * max_rotation / width) + 3
+        per_pair = n_angle * (int(2 * max_log_scale / width) + 3)
+        # short integers sort twice as fast
+        kind = np.int32 if n * per_pair < 2**31 else np.int64
+        first = pair.astype(kind) * kind(per_pair)
+        # boxes on four staggered grids: none straddles an edge on all of them
+        for edge in ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5)):
+            box = ((d_log + max_log_scale) / width + edge[0]).astype(kind) * kind(n_angle)
+            box += ((d_angle + max_rotation) / width + edge[1]).astype(kind)
+            box += first
+            box.sort()
+            start = np.flatnonzero(np.diff(box, prepend=kind(-1)))
+            count = np.diff(start, append=len(box))
+            full = count >= _LEAST_COUNT
+            count, box = count[full], box[start[full]]
+            owner, place = box // per_pair, box % per_pair
+            chance = np.maximum((in_range[owner] - count) * share, 1e-3)
+            now = -np.log10(np.maximum(gammainc(count, chance), 1e-300))
+            better = np.flatnonzero(now > surprise[owner])
+            better = better[np.lexsort((now[better], owner[better]))]
+            # the last of each owner is its best
+            better = better[np.diff(owner[better], append=-1) != 0]
+            owner = owner[better]
+            surprise[owner], expected[owner], half[owner] = now[better], chance[better], width / 2
+            center[0, owner] = (place[better] // n_angle + 0.5 - edge[0]) * width - max_log_scale
+            center[1, owner] = (place[better] % n_angle + 0.5 - edge[1]) * width - max_rotation
+    inside = np.abs(d_log - center[0, pair]) <= half[pair]
+    inside &= np.abs(d_angle - center[1, pair]) <= half[pair]
+    pair, d_log, d_angle = pair[inside], d_log[inside], d_angle[inside]
+    count = np.bincount(pair, minlength=n)
+    mean = [
+        np.bincount(pair, weights=d, minlength=n) / np.maximum(count, 1) for d in (d_log, d_angle)
+    ]
+    return *mean, count, expected, surprise, 2 * half
 
 
 def select_coherent(

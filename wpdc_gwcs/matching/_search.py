@@ -36,7 +36,7 @@ _REFERENCE_SURPLUS = 2.0
 # Sources per star of the sparser list in a subset.
 _SOURCE_SURPLUS = 1.3
 # Stars to look up by their neighbourhood and neighbours to compare, try by try.
-_TRIES = ((16, 12), (49, 12), (196, 24))
+_TRIES = ((16, 8), (49, 12), (196, 24))
 # Groups of hypotheses that are followed up.
 _N_SEEDS = 8
 # Triples of pairs tried for a linear mapping, and the share of pairs that should follow it.
