@@ -367,6 +367,8 @@ class Search:
             return None
         fit, local, pairs, scatter = self.grow_locally(some, limit, *grown[:2])
         clock.lap("refine")
+        if len(pairs[0]) < MIN_STARS:
+            return None
         mapped, leverage = _predict(points, fit, local)
         radius = self.final_radius(mapped, (part[pairs[0]], pairs[1]), scatter, leverage)
         i, j, _ = find_edges(mapped, self.stars.tree, radius, limit=self.stars.limit)
