@@ -27,8 +27,14 @@ _SUMS = (
     "wdx", "wdy", "wdxdx", "wdxdy", "wdydy", "wwvx", "wwvy",
 )  # fmt: skip
 
-# Bins along the longer side of the detector; about 130 px for the paper's 9216.
-_BINS = 70
+# Bins along the longer side of the detector; 128 px for the paper's 9216.
+_BINS = 72
+
+# Bins are made in multiples of this number, so that they can be joined by 2, 3 or 4.
+_BLOCK = 12
+
+# Stars per bin below which bins are joined further for the choice of settings.
+_STARS_PER_BIN = 4
 
 # Groups of exposures (or of stars, for one exposure) that cross-validation leaves out in turn.
 N_FOLDS = 5
@@ -44,7 +50,7 @@ class ResidualMap:
     sums : (K, 14, my, mx) ndarray, optional
         Sums of an existing map, in the order of `ResidualMap.columns`; empty if not given.
     shape : (int, int), optional
-        Bins ``(my, mx)``; square bins, 70 along the longer side, if not given.
+        Bins ``(my, mx)``; about 72 along the longer side, in multiples of 12, if not given.
 
     Notes
     -----
@@ -76,9 +82,8 @@ class ResidualMap:
         self.image_shape = (ny, nx)
         if sums is None:
             if shape is None:
-                # Even numbers, so that pairs of bins can be joined.
-                size = 2 * max(ny, nx) / _BINS
-                shape = (2 * max(1, round(ny / size)), 2 * max(1, round(nx / size)))
+                size = max(ny, nx) * _BLOCK / _BINS
+                shape = (_BLOCK * max(1, round(ny / size)), _BLOCK * max(1, round(nx / size)))
             sums = np.zeros((N_FOLDS, len(_SUMS), *shape))
         sums = np.asarray(sums, dtype=float)
         if sums.ndim != 4 or sums.shape[:2] != (N_FOLDS, len(_SUMS)):
@@ -211,33 +216,39 @@ class ResidualMap:
         cy = (np.arange(my) + 0.5) * (ny / my) - 0.5
         return np.array(np.meshgrid(cx, cy))
 
-    def coarsen(self):
-        """Join pairs of bins along both axes.
+    def coarsen(self, factor=2):
+        """Join bins along both axes.
+
+        Parameters
+        ----------
+        factor : int, optional
+            Bins joined along each axis.
 
         Returns
         -------
         ResidualMap
-            With half the bins along each axis.
+            The same residuals in larger bins.
 
         Raises
         ------
         ValueError
-            If the number of bins along an axis is odd.
+            If the factor does not divide the numbers of bins.
         """
         my, mx = self.shape
-        if my % 2 or mx % 2:
-            raise ValueError(f"only even numbers of bins can be joined in pairs, got {self.shape}")
-        coarse = ResidualMap(self.image_shape, shape=(my // 2, mx // 2))
+        if my % factor or mx % factor:
+            raise ValueError(f"factor {factor} does not divide the numbers of bins {self.shape}")
+        ky, kx = my // factor, mx // factor
+        coarse = ResidualMap(self.image_shape, shape=(ky, kx))
         s = self.sums
         # Moments move from the centres of the small bins to those of the large ones.
-        ox, oy = self._centers() - coarse._centers().repeat(2, axis=1).repeat(2, axis=2)
+        ox, oy = self._centers() - coarse._centers().repeat(factor, axis=1).repeat(factor, axis=2)
         moved = s.copy()
         moved[:, 2] += s[:, 1] * ox
         moved[:, 3] += s[:, 1] * oy
         moved[:, 4] += 2 * s[:, 2] * ox + s[:, 1] * ox**2
         moved[:, 5] += s[:, 2] * oy + s[:, 3] * ox + s[:, 1] * ox * oy
         moved[:, 6] += 2 * s[:, 3] * oy + s[:, 1] * oy**2
-        coarse.sums = moved.reshape(*s.shape[:2], my // 2, 2, mx // 2, 2).sum((3, 5))
+        coarse.sums = moved.reshape(*s.shape[:2], ky, factor, kx, factor).sum((3, 5))
         return coarse
 
     def without(self, fold):
@@ -385,7 +396,7 @@ def build_lookup_table(
     method : {'cubic', 'linear'}, optional
         How the table interpolates between its nodes.
     draft : bool, optional
-        Interpolate bins twice as large, without uncertainty and with settings that only one kernel
+        Interpolate larger bins, without uncertainty and with settings that only one kernel
         was tried for: a small part of the time, for iterations.
 
     Returns
@@ -407,7 +418,7 @@ def build_lookup_table(
     1. Bins are represented by their inverse-variance means at their weighted centroids.  A mean
        over a bin is not the value at its centroid: half the trace of Hessian times second moments
        is taken off, with a pilot surface.
-    2. On bins twice as large, every kernel and length is diagonalised once, so that generalised
+    2. On larger bins, every kernel and length is diagonalised once, so that generalised
        cross-validation over all smoothings (twelve decades) and polynomial degrees costs next to
        nothing.
     3. The best few, and no table at all, are compared by leaving out one group of exposures after
@@ -452,7 +463,7 @@ def build_lookup_table(
         choice, candidates = choose_table(residual_map, lut=lut)
     elif residual_map.n_stars < _MIN_STARS_TABLE:
         choice = TableChoice("none")
-    coarse = residual_map.coarsen()
+    coarse = _coarse(residual_map)
     if choice is None:
         choice = _first_choice(_Bins(coarse))
     if choice.kernel == "none":
@@ -501,7 +512,7 @@ def choose_table(residual_map, *, lut="auto"):
         if lut == "always":
             raise FitError(f"{n} stars cannot carry a look-up table, {_MIN_STARS_TABLE} are needed")
         return TableChoice("none"), ()
-    return _choose(residual_map.coarsen(), allow_none=lut == "auto")
+    return _choose(_coarse(residual_map), allow_none=lut == "auto")
 
 
 @dataclass(frozen=True, eq=False)
@@ -540,6 +551,14 @@ def _assign_folds(maps):
         moved.sums[k % N_FOLDS] = one.sums.sum(0)
         total = total + moved
     return total
+
+
+def _coarse(residual_map):
+    """Larger bins, on which every setting is tried: a smoother on M bins costs M^3."""
+    my, mx = residual_map.shape
+    factors = [k for k in (2, 3, 4) if my % k == 0 and mx % k == 0] or [1]
+    enough = [k for k in factors if residual_map.n_stars * k * k >= _STARS_PER_BIN * my * mx]
+    return residual_map.coarsen(enough[0] if enough else factors[-1])
 
 
 class _Bins:

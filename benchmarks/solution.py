@@ -1,0 +1,193 @@
+"""Accuracy, errors, time and memory of the joint solution, from pairs to instrument and attitudes.
+
+    python benchmarks/solution.py [--cases smooth-dense ...] [--seeds 1 2] [--scamp]
+
+Fields come from the laboratory that stands beside the project (``truth.py``, ``field.py``,
+``judge.py``), found through the environment variable WPDC_GWCS_LAB or as ../shared/lab.  The true
+pairs are taken, 0.2 % of them made wrong, and the solution is compared with the truth on a grid
+over the whole detector.  20 % of the stars are held out in a second solution to measure the pulls.
+"""
+
+import argparse
+import os
+import resource
+import shutil
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+LIMITS = {
+    "smooth-dense": 0.0035,
+    "smooth-sparse": 0.0068,
+    "fine-dense": 0.0092,
+    "fine-sparse": 0.0230,
+    "single": 0.0058,
+    "single-sparse": 0.0185,
+}
+NEW_EXPOSURE_LIMIT = 0.010
+WRONG = 0.002  # share of wrong pairs
+HOLDOUT = 0.2
+
+
+def find_lab():
+    root = Path(__file__).resolve().parent.parent
+    lab = Path(os.environ.get("WPDC_GWCS_LAB") or root.parent / "shared" / "lab")
+    if not (lab / "judge.py").is_file():
+        sys.exit(f"laboratory not found: {lab} (set WPDC_GWCS_LAB to the folder of judge.py)")
+    sys.path.insert(0, str(lab))
+
+
+def pairs(truth, header, sources, ref, name, rng):
+    """True pairs of one exposure as the solver takes them, some of them made wrong by a few px."""
+    from wpdc_gwcs.instrument import Exposure
+
+    true_id = np.asarray(sources["true_id"])
+    real = true_id >= 0
+    ids = np.asarray(ref["source_id"])
+    order = np.argsort(ids)
+    row = order[np.searchsorted(ids[order], true_id[real])]
+    x, y, x_err, y_err = (np.asarray(sources[c], float)[real] for c in ("x", "y", "x_err", "y_err"))
+    wrong = rng.uniform(size=x.size) < WRONG
+    x[wrong] += rng.normal(0, 5, wrong.sum())
+    y[wrong] += rng.normal(0, 5, wrong.sum())
+    return Exposure(
+        name, x, y, np.asarray(ref["ra"])[row], np.asarray(ref["dec"])[row],
+        crval=(header["CRVAL1"], header["CRVAL2"]),
+        cd=np.array([[header["CD1_1"], header["CD1_2"]], [header["CD2_1"], header["CD2_2"]]]),
+        x_err=x_err, y_err=y_err,
+    )  # fmt: skip
+
+
+def simulate(case, seed, **changes):
+    from field import exposures
+    from judge import CASES
+
+    ref, observed = exposures(seed=seed, **{**CASES[case], **changes})
+    rng = np.random.default_rng(seed)
+    truths = [t for t, _, _ in observed]
+    return truths, [pairs(*o, ref, f"e{k:02d}", rng) for k, o in enumerate(observed)]
+
+
+def solve(truths, exposures, **options):
+    from wpdc_gwcs.instrument import solve_instrument
+
+    truth = truths[0]
+    return solve_instrument(
+        exposures, image_shape=(truth.ny, truth.nx), crpix=(truth.x0, truth.y0), **options
+    )
+
+
+def errors(truths, result, n=101):
+    """Errors of every exposure on the grid, (n_exposures, 2, n * n), px."""
+    return np.array(
+        [grid_error(t, calibration(f, result)[0], n) for t, f in zip(truths, result.exposures)]
+    )
+
+
+def calibration(fit, result):
+    from wpdc_gwcs.solution import Calibration
+
+    solution = result.solution if fit.pv is None else replace(result.solution, pv=fit.pv)
+    frame = Calibration(
+        fit.name, solution, fit.crval, fit.cd, fit.covariance, pv_covariance=fit.pv_covariance
+    )
+    return frame.wcs, frame
+
+
+def grid_error(truth, wcs, n):
+    x, y = truth.grid(n)
+    return truth.error_px(*wcs(x, y), x, y)
+
+
+def rms(error):
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
+def pulls(truths, exposures):
+    """Residual over predicted error of held-out stars, wrong pairs left out."""
+    rng = np.random.default_rng(0)
+    kept = [rng.uniform(size=len(e.x)) >= HOLDOUT for e in exposures]
+    result = solve(truths, [replace(e, use=k) for e, k in zip(exposures, kept)])
+    values = []
+    for e, k, fit in zip(exposures, kept, result.exposures):
+        _, frame = calibration(fit, result)
+        sigma_x, sigma_y, _ = frame.uncertainty(e.x, e.y)
+        values += [
+            (fit.dx / np.hypot(fit.x_err, sigma_x))[~k],
+            (fit.dy / np.hypot(fit.y_err, sigma_y))[~k],
+        ]
+    values = np.concatenate(values)
+    return float(np.std(values[np.abs(values) < 5]))
+
+
+def new_exposure(seed, result):
+    """A shallow exposure of the same camera against a stored solution: attitude only."""
+    # Another sky and other noise, the same distortion.
+    truths, exposures = simulate(
+        "smooth-dense", seed, n=3, density=3.0, sky_seed=seed * 1000 + 7, dither=60.0
+    )
+    return rms(errors(truths, solve(truths, exposures, solution=result.solution)))
+
+
+def scamp_beside(case, seed):
+    import judge
+
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder).resolve()
+        ref, observed, catalogs = judge.build(case, seed, folder)
+        return [judge.scamp_beside(ref, observed, catalogs, folder, d)["rms"] for d in (3, 5)]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cases", nargs="+", choices=LIMITS, default=list(LIMITS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1])
+    parser.add_argument("--refine", choices=("attitude", "pv", "auto"), default="attitude")
+    parser.add_argument("--no-pulls", action="store_true", help="skip the second solution")
+    parser.add_argument("--scamp", action="store_true", help="run SCAMP beside, where installed")
+    options = parser.parse_args()
+    find_lab()
+    with_scamp = options.scamp and shutil.which("scamp")
+    if options.scamp and not with_scamp:
+        print("scamp is not installed: left out")
+    print(
+        f"{'case':14s} {'seed':>4s} {'rms px':>8s} {'limit':>7s} {'median':>7s} {'max':>7s} "
+        f"{'<0.01':>6s} "
+        f"{'pull':>6s} {'s':>6s} {'MiB':>6s}  table" + ("  SCAMP 3/5" if with_scamp else "")
+    )
+    for seed in options.seeds:
+        for case in options.cases:
+            truths, exposures = simulate(case, seed)
+            start = time.perf_counter()
+            result = solve(truths, exposures, refine=options.refine)
+            seconds = time.perf_counter() - start
+            memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            error = errors(truths, result)
+            total = np.hypot(error[:, 0], error[:, 1])
+            pull = np.nan if options.no_pulls else pulls(truths, exposures)
+            table = result.solution.statistics["table"]
+            line = (
+                f"{case:14s} {seed:4d} {rms(error):8.5f} {LIMITS[case]:7.4f} "
+                f"{np.median(total):7.4f} "
+                f"{total.max():7.4f} {np.mean(total < 0.01):6.1%} {pull:6.3f} {seconds:6.1f} "
+                f"{memory:6.0f}  "
+                f"{table['kernel']} {table['epsilon']:g} degree {table['degree']}, "
+                f"{table['freedom']:.0f} parameters"
+            )
+            if with_scamp:
+                line += "  {:.2f} {:.2f}".format(*scamp_beside(case, seed))
+            print(line, flush=True)
+            if case == "smooth-dense":
+                print(
+                    f"{' + 3 / arcmin2':14s} {seed:4d} {new_exposure(seed, result):8.5f} "
+                    f"{NEW_EXPOSURE_LIMIT:7.4f}",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()
