@@ -74,24 +74,7 @@ def write_fits(obj, path, *, overwrite=False):
     ``A = CD CD0^-1``.  The one row of ``WPDC_INSTRUMENT`` has CD0, PV0, the zero-based CRPIX and
     the nominal CRVAL as they are, so that what is read back is the same to the last bit.
     """
-    solution = _parts(obj)[0]
-    hdus = [fits.PrimaryHDU(header=tpv_header(obj)), _instrument_hdu(solution)]
-    table = solution.lookup_table
-    if table is not None:
-        x, y = np.meshgrid(table.x_grid + 1.0, table.y_grid + 1.0)
-        values = (x, y, table.dx, table.dy)
-        hdu = fits.BinTableHDU.from_columns(
-            [
-                fits.Column(name, "D", unit="pixel", array=np.asarray(v).ravel())
-                for name, v in zip(_TABLE_COLUMNS, values, strict=True)
-            ],
-            name=_TABLE_NAME,
-        )
-        hdu.header["METHOD"] = (table.method, "interpolation between the nodes")
-        hdu.header["NXGRID"] = (len(table.x_grid), "nodes along x, which runs fastest")
-        hdu.header["NYGRID"] = (len(table.y_grid), "nodes along y")
-        hdus.append(hdu)
-    _write_hdus(hdus, path, overwrite)
+    _write_hdus([fits.PrimaryHDU(header=tpv_header(obj)), *_own_hdus(obj)], path, overwrite)
 
 
 def read_fits(path):
@@ -137,11 +120,11 @@ def read_fits(path):
     version = header_text(header, "WPDCVERS")
     if version:
         _check_version(version, path)
-    tan = parse_tan(header, name=name)
+    tan = parse_tan(header, name=name, ignore_tables=table is not None)
     if tan is None:
         raise FileFormatError(
-            f"{name}: projection must be TAN or TPV to be a calibration, "
-            f"got {header_text(header, 'CTYPE1')!r}; as a starting WCS it can be read"
+            f"{name}: header must be TAN or TPV without look-up tables of others to be a "
+            f"calibration, got {header_text(header, 'CTYPE1')!r}; as a starting WCS it can be read"
         )
     if instrument is None or not _agree(instrument, tan):
         instrument = {"crpix": tan.crpix, "cd": tan.cd, "crval": tan.crval, "pv": tan.pv}
@@ -183,7 +166,8 @@ def write_cpdis(obj, path, *, overwrite=False):
     ``CPDIS`` (Paper IV) acts on the pixel position, in front of CD and PV, and is bilinear.  A
     shift d that does there what the table does behind PV is found at every node by Newton's method:
     ``PV(CD (x + d - CRPIX)) = PV(CD (x - CRPIX)) - CD table(x)``.  The nodes are made denser by
-    factors of two until astropy.wcs agrees everywhere.
+    factors of two until astropy.wcs agrees everywhere.  The tables of the format ``fits`` are there
+    as well, for an exact way back.
     """
     header = tpv_header(obj)
     solution = _parts(obj)[0]
@@ -209,7 +193,7 @@ def write_cpdis(obj, path, *, overwrite=False):
             WPDCWarning,
         )
     _add_history(hdus[0].header, f"greatest deviation of astropy.wcs: {worst:.3g} px")
-    _write_hdus(hdus, path, overwrite)
+    _write_hdus([*hdus, *_own_hdus(obj)], path, overwrite)
     return worst
 
 
@@ -433,25 +417,36 @@ def _read_table(hdu, name):
         raise FileFormatError(f"{name}: {first_line(problem)}") from problem
 
 
-def _instrument_hdu(solution):
-    pv = solution.pv
+def _own_hdus(obj):
+    """Make the tables that bring the instrument back exactly."""
+    solution = _parts(obj)[0]
+    pv, table = solution.pv, solution.lookup_table
     values = {
         "CRPIX": ("2D", "pixel", solution.crpix),
         "CD": ("4D", "deg/pixel", solution.cd),
         "CRVAL": ("2D", "deg", solution.crval),
-        "DEGREE": ("1J", "", pv.degree),
-        "RADIAL": ("1L", "", pv.radial),
+        "DEGREE": ("1J", None, pv.degree),
+        "RADIAL": ("1L", None, pv.radial),
         "PV": (f"{pv.coefficients.size}D", "deg", pv.coefficients),
     }
-    hdu = fits.BinTableHDU.from_columns(
-        [
-            fits.Column(name, form, unit=unit or None, array=np.asarray(value).reshape(1, -1))
-            for name, (form, unit, value) in values.items()
-        ],
-        name=_INSTRUMENT_NAME,
-    )
-    hdu.header.add_comment("CRPIX counts from zero; PV: axis 1, then axis 2, by FITS index")
-    return hdu
+    columns = [
+        fits.Column(name, form, unit=unit, array=np.asarray(value).reshape(1, -1))
+        for name, (form, unit, value) in values.items()
+    ]
+    instrument = fits.BinTableHDU.from_columns(columns, name=_INSTRUMENT_NAME)
+    instrument.header.add_comment("CRPIX counts from zero; PV: axis 1, axis 2, by FITS index")
+    if table is None:
+        return [instrument]
+    x, y = np.meshgrid(table.x_grid + 1.0, table.y_grid + 1.0)
+    columns = [
+        fits.Column(name, "D", unit="pixel", array=np.asarray(value).ravel())
+        for name, value in zip(_TABLE_COLUMNS, (x, y, table.dx, table.dy), strict=True)
+    ]
+    nodes = fits.BinTableHDU.from_columns(columns, name=_TABLE_NAME)
+    nodes.header["METHOD"] = (table.method, "interpolation between the nodes")
+    nodes.header["NXGRID"] = (len(table.x_grid), "nodes along x, which runs fastest")
+    nodes.header["NYGRID"] = (len(table.y_grid), "nodes along y")
+    return [instrument, nodes]
 
 
 def _read_instrument(hdu, name):

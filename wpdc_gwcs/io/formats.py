@@ -7,7 +7,7 @@ from astropy.table import Table
 
 from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.files import check_output, file_kind, split_extension
-from wpdc_gwcs.io.headers import parse_tan, parse_wcs, read_headers
+from wpdc_gwcs.io.headers import header_text, parse_tan, parse_wcs, read_headers
 
 __all__ = ["FORMATS", "read", "read_wcs", "write"]
 
@@ -70,8 +70,8 @@ def read_wcs(source):
     -------
     wcs : `~gwcs.wcs.WCS` or `~astropy.wcs.WCS`
         For TAN, TPV and TAN + PV an exact gwcs with the numbers of the header (no change of
-        celestial frame); for ASDF the stored one; for SIP and the rest an `astropy.wcs.WCS` in
-        ICRS.
+        celestial frame) and the look-up table of this package where there is one; for ASDF the
+        stored one; for SIP and the rest an `astropy.wcs.WCS` in ICRS.
 
     Raises
     ------
@@ -99,6 +99,8 @@ def read_wcs(source):
     headers = read_headers(source)
     if len(headers) > 1:
         raise FileFormatError(f"{source}: has {len(headers)} WCS headers; choose one with path[N]")
+    if header_text(headers[0], "WPDCVERS") and header_text(headers[0], "CTYPE1") == "RA---TPV":
+        return read(source).wcs
     return _wcs_of(headers[0], str(source), plain)
 
 

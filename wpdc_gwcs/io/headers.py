@@ -40,6 +40,7 @@ __all__ = [
 ]
 
 _PV_CARD = re.compile(r"PV([12])_(\d+)")
+_TABLE_CARD = re.compile(r"(CPDIS|CQDIS|D2IMDIS)[12]")
 _CARD_START = re.compile(r"[A-Z0-9_-]{1,8} *= *\S")
 _LONGITUDES = ("RA", "GLON", "ELON")
 _LATITUDES = ("DEC", "GLAT", "ELAT")
@@ -374,7 +375,7 @@ def header_shape(header):
     return None
 
 
-def parse_tan(header, *, name="header", error=FileFormatError):
+def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=False):
     """Read a TAN, TPV or TAN + PV header exactly.
 
     Parameters
@@ -385,12 +386,14 @@ def parse_tan(header, *, name="header", error=FileFormatError):
         What messages call the header.
     error : type, optional
         Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
+    ignore_tables : bool, optional
+        Whether to read a header with look-up tables (``CPDIS``, ``D2IMDIS``) as if it had none.
 
     Returns
     -------
     tan : TanHeader or None
-        `None` for celestial headers of other kinds (SIP, other projections, galactic axes), which
-        `parse_wcs` reads.
+        `None` for celestial headers of other kinds (SIP, look-up tables, other projections,
+        galactic axes), which `parse_wcs` reads.
 
     Raises
     ------
@@ -406,6 +409,8 @@ def parse_tan(header, *, name="header", error=FileFormatError):
     """
     order, codes = _celestial_axes(header, name, error)
     if codes[0] not in ("TAN", "TPV") or header_text(header, "CTYPE1")[:2] not in ("RA", "DE"):
+        return None
+    if not ignore_tables and any(_TABLE_CARD.fullmatch(key) for key in header):
         return None
     numbers = {
         (int(m[1]), int(m[2])) for key in header if (m := _PV_CARD.fullmatch(key)) is not None
