@@ -38,7 +38,7 @@ FLAG_BLENDED = 4  # a neighbour disturbs the core
 FLAG_COSMIC = 8  # sharper than the PSF: cosmic ray or hot pixel
 FLAG_EXTENDED = 16  # broader than the PSF: galaxy, or an unresolved blend
 FLAG_BAD_PIXEL = 32  # a masked pixel within the core
-FLAG_FIT_FAILED = 64  # no PSF fit: the position is the windowed centroid
+FLAG_FIT_FAILED = 64  # the PSF does not fit: no star, or the windowed centroid was kept
 
 _SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 

@@ -28,7 +28,7 @@ _MIN_MISMATCH = 0.003
 
 _MAX_STEP = 0.5  # px per iteration
 _MAX_ITERATIONS = 12
-_CONVERGED = 3e-5  # px
+_CONVERGED = 1e-4  # px
 
 
 @dataclass(frozen=True)
@@ -142,6 +142,19 @@ class StarFits:
     chi2: np.ndarray
     valid: np.ndarray
 
+    def updated(self, rows, other):
+        """Return these fits with some rows replaced by those of other fits."""
+        columns = []
+        for old, new in zip(self._columns(), other._columns()):
+            column = old.copy()
+            column[rows] = new
+            columns.append(column)
+        x, y, flux, *rest = columns
+        return StarFits(Stars(x, y, flux), *rest)
+
+    def _columns(self):
+        return *self.stars, self.covariance, self.chi2, self.valid
+
 
 def fit_stars(field, profile, noise, stars, *, radius, own=None):
     """Fit position and flux of stars, each on the pixels within a radius of its start.
@@ -202,7 +215,7 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
         flux[active] = np.maximum(flux[active] + step[:, 2], 0.2 * flux[active])
         away = np.hypot(x[active] - x0[active], y[active] - y0[active]) > radius
         done = (np.abs(shift).max(axis=1, initial=0) < _CONVERGED) & (
-            np.abs(step[:, 2]) < 1e-4 * flux[active]
+            np.abs(step[:, 2]) < 1e-3 * flux[active]
         )
         converged[active[done & ~away]] = True
         active = active[~done & ~away]

@@ -37,6 +37,12 @@ _MAX_ROUNDNESS = 0.4
 # Stars whose residuals tell the error of the PSF.
 _MAX_STARS = 1000
 _MIN_STARS = 8
+# Reduced chi square, absolute and relative to that of sources as bright, from which a source is
+# not a star.
+_MAX_CHI2 = 4.0
+# Light of neighbours, in standard deviations of the sky, that does not matter to a fit.
+_NEGLIGIBLE = 0.05
+_CHUNK = 10_000
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
 
@@ -170,6 +176,7 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
         Copy of the sources with new ``x``, ``y``, ``x_err``, ``y_err``, ``flux``, ``flux_err``,
         ``snr``, and ``chi2``, the chi square per degree of freedom.  Where the fit failed, the
         values stay and ``flags`` has `wpdc_gwcs.detection.FLAG_FIT_FAILED`; ``chi2`` is NaN.
+        The flag is also set where the fit is far worse than that of other sources as bright.
 
     Notes
     -----
@@ -186,7 +193,7 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
     --------
     >>> fit_centroids(background, sources, epsf)  # doctest: +SKIP
     """
-    field = _field_of(data, error)
+    field = _field_of(data, error, saturation=sources.meta.get("saturation"))
     if passes < 1:
         raise ValueError(f"passes must be at least 1, got {passes}")
     profile = _from_photutils(epsf)
@@ -195,31 +202,61 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
     stars = _stars_of(sources)
     flags, is_round = _flags_and_shape(sources)
     noise = Noise(0.0 if gain is None else 1 / gain, 0.02)
+    candidates = np.flatnonzero(is_round & (flags == 0) & (stars.flux > 0))
+    candidates = candidates[np.argsort(stars.flux[candidates])[::-1][:_MAX_STARS]]
+    fits = fit_stars(field, profile, noise, stars.take(candidates), radius=radius)
+    clean = star_like(fits.stars.flux, fits.chi2, fits.valid)
+    noise = estimate_noise(field, profile, noise, fits.stars.take(clean), radius=radius, gain=gain)
+    log.info("noise of the fits: %s", noise)
+    fits = fit_stars(field, profile, noise, stars, radius=radius)
+    for _ in range(passes - 1):
+        model, own = _model_of(field, profile, fits, stars, fwhm)
+        rows = _disturbed(field, model, profile, own, radius)
+        if len(rows) == 0:
+            break
+        work = replace(field, image=field.image - model)
+        again = fit_stars(work, profile, noise, own.take(rows), radius=radius, own=own.take(rows))
+        fits = fits.updated(rows, again)
+    return _fitted_table(sources, fits, flags, fwhm)
+
+
+def _model_of(field, profile, fits, stars, fwhm):
+    """Image of all stars as fitted, and the stars in it: those without a fit have no flux."""
+    good = fits.valid & _near(fits.stars, stars, fwhm)
+    own = Stars(*(np.where(good, new, old) for new, old in zip(fits.stars, stars)))
     step = max(1, min(field.rms.shape) // 500)
     faintest = 0.1 * float(np.median(field.rms[::step, ::step]))
-    work, own = field, None
-    for number in range(passes):
-        fits = fit_stars(work, profile, noise, stars, radius=radius, own=own)
-        moved = np.hypot(fits.stars.x - sources["x"], fits.stars.y - sources["y"])
-        good = fits.valid & (moved < max(0.5 * fwhm, 1.0))
-        stars = Stars(*(np.where(good, new, old) for new, old in zip(fits.stars, stars)))
-        if number == 0:
-            clean = np.flatnonzero(star_like(stars.flux, fits.chi2, good & is_round & (flags == 0)))
-            brightest = clean[np.argsort(stars.flux[clean])[::-1][:_MAX_STARS]]
-            noise = estimate_noise(
-                field, profile, noise, stars.take(brightest), radius=radius, gain=gain
-            )
-            log.info("noise of the fits: %s", noise)
-        if number < passes - 1:
-            own = stars._replace(flux=np.where(good, stars.flux, 0.0))
-            model = render(field.image.shape, profile, own, faintest=faintest)
-            work = replace(field, image=field.image - model)
-    return _fitted_table(sources, fits, good, flags)
+    drawn = own.take(good)
+    return render(field.image.shape, profile, drawn, faintest=faintest), own._replace(
+        flux=np.where(good, own.flux, 0.0)
+    )
 
 
-def _fitted_table(sources, fits, good, flags):
+def _disturbed(field, model, profile, own, radius):
+    """Rows of the stars whose pixels hold light of others that is not far below the noise."""
+    lit = replace(field, image=model)
+    half = int(np.ceil(radius))
+    result = []
+    for start in range(0, len(own.x), _CHUNK):
+        stars = own.take(slice(start, start + _CHUNK))
+        xc, yc, pixels, use, sky = lit.cut(stars, half, radius)
+        shares = profile.shares(stars.x, stars.y)
+        mine = profile.evaluate(stars.x - xc, stars.y - yc, half, shares, gradient=False)[0]
+        light = pixels - stars.flux[:, None] * mine
+        limit = _NEGLIGIBLE * (np.sqrt(sky) + 0.01 * np.abs(pixels))
+        result.append(start + np.flatnonzero((use & (np.abs(light) > limit)).any(axis=1)))
+    return np.concatenate(result) if result else np.zeros(0, int)
+
+
+def _near(stars, start, fwhm):
+    """Mark the fits that stayed with the source they began at."""
+    return np.hypot(stars.x - start.x, stars.y - start.y) < max(0.5 * fwhm, 1.0)
+
+
+def _fitted_table(sources, fits, flags, fwhm):
     """Copy of the sources with the results of the fits."""
     result = sources.copy()
+    good = fits.valid & _near(fits.stars, _stars_of(sources), fwhm)
     error = np.sqrt(np.where(good[:, None], np.einsum("sii->si", fits.covariance), np.nan))
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = fits.stars.flux / error[:, 2]
@@ -236,7 +273,10 @@ def _fitted_table(sources, fits, good, flags):
         old = np.asarray(sources[name], float) if name in sources.colnames else np.nan
         result[name] = np.where(good, values, old)
     result["chi2"] = np.where(good, fits.chi2, np.nan)
-    result["flags"] = flags | np.where(good, 0, _FLAG_FIT_FAILED)
+    # Neither a star nor noise: far worse than its like, which share the error of the PSF.
+    alike = star_like(fits.stars.flux, fits.chi2, good, limit=_MAX_CHI2)
+    poor = ~good | (~alike & (fits.chi2 > _MAX_CHI2))
+    result["flags"] = flags | np.where(poor, _FLAG_FIT_FAILED, 0)
     return result
 
 
@@ -268,12 +308,16 @@ def _typical_fwhm(sources):
     raise ValueError("the sources have no FWHM: neither a column nor an entry in meta")
 
 
-def _field_of(data, error):
+def _field_of(data, error, saturation=None):
     """Image, noise and mask of a Background, or of a plain array and its error."""
     if hasattr(data, "rms"):
         if error is not None:
             raise ValueError("error must not be given: the Background has its own")
-        return Field(data.image, data.rms, data.mask)
+        if saturation is None:
+            return Field(data.image, data.rms, data.mask)
+        # The wings of a saturated star still tell its flux, which matters to its neighbours.
+        full = data.data >= saturation
+        return Field(data.image, data.rms, full if data.mask is None else full | data.mask)
     image = np.asarray(data)
     if image.ndim != 2:
         raise ValueError(f"the image must be 2-D, got {image.ndim} dimensions")

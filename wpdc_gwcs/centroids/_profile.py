@@ -68,7 +68,7 @@ class Profile:
         if n == 1:
             return self.coefficients, np.ones((1, 1))
         left, sizes, right = np.linalg.svd(flat, full_matrices=False)
-        keep = sizes > 1e-5 * sizes[0]
+        keep = sizes > 1e-4 * sizes[0]
         shares = left[:, keep] * sizes[keep]
         return right[keep].reshape(-1, *self.coefficients.shape[1:]), shares
 
