@@ -59,7 +59,7 @@ _SATURATION_KEYS = ("SATURATE", "SATURATION", "SATURAT", "SATLEVEL", "SATURATA")
 _FACTS = {"filter": ("FILTER", "FILTER1", "BAND"), "object": ("OBJECT",), "date": ("DATE-OBS",)}
 # Extensions that go with an image and are none, though they carry its WCS.
 _COMPANIONS = re.compile(
-    r"(ERR(OR)?|DQ|WHT|WEIGHT|W(EIGHT)?MAP|MASK|BPM|VAR(IANCE)?|RMS|IVAR|INVVAR|UNC(ERT)?|FLAGS?"
+    r"(ERR(OR)?|DQ|WHT|WEIGHT|W(EIGHT)?MAP|MASK|BPM|VAR(IANCE)?|RMS|IVAR|INVVAR|UNC(ERT)?|FLAGS?|FLG"
     r"|CON|CTX|D2IMARR|WCSDVARR|BACKGROUND|BKG|OOD)",
     re.IGNORECASE,
 )
