@@ -26,7 +26,7 @@ from gwcs import WCS
 from gwcs import coordinate_frames as cf
 
 from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, TangentSky
-from wpdc_gwcs.models.blocks import BLOCK_SIZE, evaluate_blocks, run_blocks
+from wpdc_gwcs.models.blocks import evaluate_blocks, run_blocks
 from wpdc_gwcs.models.mapping import PlaneMap, fit_polynomial
 
 __all__ = ["DetectorWCS", "build_wcs", "sky_map", "to_stock_wcs"]
@@ -284,7 +284,7 @@ def sky_map(wcs, *, image_shape=None, out=None):
         for array, values in zip((ra, dec), transform(x, y), strict=True):
             array[start:stop] = values.reshape(n_rows, nx)
 
-    run_blocks(fill, ny, step=max(1, BLOCK_SIZE // nx), threaded=nx * ny >= 4 * BLOCK_SIZE)
+    run_blocks(fill, ny, weight=nx)
     return ra, dec
 
 

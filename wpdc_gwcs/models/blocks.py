@@ -5,6 +5,7 @@
     inputs (any shape) --broadcast--> blocks --function, in threads--> outputs (same shape)
 """
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,12 +13,15 @@ import numpy as np
 
 __all__ = ["BLOCK_SIZE", "evaluate_blocks", "run_blocks"]
 
-#: Points per block: the work arrays stay in a core's caches, and a step over them takes long enough
-#: that threads seldom wait for each other's interpreter lock.
-BLOCK_SIZE = 16384
+#: Points per block where one thread works: the work arrays stay in a core's second-level cache.
+BLOCK_SIZE = 8192
+
+# Points per block where several do.  A thread that finds the interpreter lock taken sleeps and is
+# woken, which costs some 50 us; steps this long make that rare, and it weighs more than the cache.
+_THREADED_BLOCK_SIZE = 65536
 
 # Below this many points the threads cost more than they bring.
-_THREADED_SIZE = 4 * BLOCK_SIZE
+_THREADED_SIZE = 65536
 
 _MAX_THREADS = 4
 
@@ -28,8 +32,8 @@ def _n_threads():
     return min(_MAX_THREADS, os.cpu_count() or 1)
 
 
-def run_blocks(function, size, *, step=BLOCK_SIZE, threaded=None):
-    """Call ``function(start, stop)`` over ``range(size)`` in blocks, threaded when there are many.
+def run_blocks(function, size, *, weight=1):
+    """Call ``function(start, stop)`` over ``range(size)`` in blocks, threaded when it is worth it.
 
     Parameters
     ----------
@@ -37,16 +41,18 @@ def run_blocks(function, size, *, step=BLOCK_SIZE, threaded=None):
         Called once for each block; blocks are independent of each other.
     size : int
         Number of elements.
-    step : int, optional
-        Elements per block.
-    threaded : bool, optional
-        Whether to use threads; by default when ``size`` is large.
+    weight : int, optional
+        Points in each element, for example the length of a row.
     """
+    n_threads = _n_threads() if size * weight >= _THREADED_SIZE else 1
+    if n_threads == 1:
+        step = max(1, BLOCK_SIZE // weight)
+    else:
+        # As many blocks for one thread as for the other.
+        n_blocks = n_threads * math.ceil(size * weight / (_THREADED_BLOCK_SIZE * n_threads))
+        step = max(1, math.ceil(size / n_blocks))
     starts = range(0, size, step)
-    if threaded is None:
-        threaded = size >= _THREADED_SIZE
-    n_threads = min(_n_threads(), len(starts)) if threaded else 1
-    if n_threads < 2:
+    if n_threads == 1:
         for start in starts:
             function(start, min(start + step, size))
         return

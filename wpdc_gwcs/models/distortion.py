@@ -151,7 +151,7 @@ class DistortionCorrection(Model):
             crpix,
             radial=radial,
             radial_matrix=cd,
-            grid=None if cells is None else cells.negated(),
+            grid=None if cells is None else cells.transformed(-np.eye(2)),
         )
         self._cache = (numbers, cells, plane_map)
         return plane_map
@@ -220,8 +220,8 @@ class DistortionCorrection(Model):
 class DistortionInverse(Model):
     """Undistorted to detector pixels: the inverse of `DistortionCorrection`, by Newton's method.
 
-    Every answer has been verified by its residual (1e-9 px).  NaN where there is none, which
-    includes all points whose answer would lie outside the table's nodes.
+    Every answer has been verified by its residual, or a bound of it (1e-9 px).  NaN where there is
+    none, which includes all points whose answer would lie outside the table's nodes.
 
     Parameters
     ----------
@@ -327,15 +327,13 @@ class DetectorToSky(Model):
         function : callable
             ``function(x, y) -> ra, dec``.
         """
-        undistort = self.distortion._plane_map()
-        sky = self.sky
-        to_sky = sky._block_function(sky.crpix.value, sky.cd.value, sky.crval.value)
+        to_plane, deproject = self.sky._after(self.distortion._plane_map())
         if box is None:
-            return lambda x, y: to_sky(*undistort(x, y))
+            return lambda x, y: deproject(*to_plane(x, y))
         (x_low, x_high), (y_low, y_high) = box
 
         def function(x, y):
-            ra, dec = to_sky(*undistort(x, y))
+            ra, dec = deproject(*to_plane(x, y))
             # Written so that NaN counts as outside.
             if len(x) and not (
                 x.min() >= x_low and x.max() <= x_high and y.min() >= y_low and y.max() <= y_high

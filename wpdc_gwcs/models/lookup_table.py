@@ -146,7 +146,8 @@ class LookupTable(Model):
             along_y = np.stack([low, high - low])  # q, k, j, x
             low, high = along_y[..., :-1], along_y[..., 1:]
             both = np.stack([low, high - low])  # p, q, k, j, i
-            cells = CellGrid(x_grid[[0, -1]], y_grid[[0, -1]], np.moveaxis(both, 2, 0))
+            coefficients = np.moveaxis(both, 2, 0)
+            cells = CellGrid(x_grid[[0, -1]], y_grid[[0, -1]], coefficients, smooth=False)
         self._cache = (displacement.copy(), cells)
         return cells
 

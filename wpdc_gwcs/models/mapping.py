@@ -147,23 +147,28 @@ def _derivative(coefficients, axis):
     return coefficients[: n - 1, 1:] * factors
 
 
-def _horner_columns(columns, s, *, derivative=False):
-    """Sum of ``columns[:, p] s**p``, and its derivative by s when asked for."""
+def _horner_columns(columns, s, total, slope=None):
+    """Write the sum of ``columns[:, p] s**p``, and its derivative by s when asked for."""
     n = columns.shape[1]
-    total = columns[:, n - 1] * s
+    np.multiply(columns[:, n - 1], s, out=total)
     total += columns[:, n - 2]
-    if not derivative:
-        for p in range(n - 3, -1, -1):
-            total *= s
-            total += columns[:, p]
-        return total
-    slope = columns[:, n - 1].copy()
+    if slope is not None:
+        slope[:] = columns[:, n - 1]
     for p in range(n - 3, -1, -1):
-        slope *= s
-        slope += total
+        if slope is not None:
+            slope *= s
+            slope += total
         total *= s
         total += columns[:, p]
-    return total, slope
+
+
+# Points whose four coefficients are worked on at a time: they and their kin stay in a core's
+# second-level cache, whatever the length of a block.
+_PART_SIZE = 16384
+
+
+def _parts(n):
+    return (slice(start, min(start + _PART_SIZE, n)) for start in range(0, n, _PART_SIZE))
 
 
 class _Scratch(threading.local):
@@ -194,9 +199,12 @@ class CellGrid:
         First and last edge.
     coefficients : (2, n, n, ny, nx) ndarray
         ``coefficients[k, p, q, j, i]`` multiplies ``s**p t**q`` in output k in cell (j, i).
+    smooth : bool, keyword-only
+        Whether the first derivatives are continuous from cell to cell.
     """
 
-    def __init__(self, x_range, y_range, coefficients):
+    def __init__(self, x_range, y_range, coefficients, *, smooth):
+        self.smooth = smooth
         self.x_low, self.x_high = (float(edge) for edge in x_range)
         self.y_low, self.y_high = (float(edge) for edge in y_range)
         self.ny, self.nx = coefficients.shape[-2:]
@@ -206,6 +214,16 @@ class CellGrid:
         # The four powers of s of a cell side by side: one take of 32 bytes fetches them all, and
         # fetching is what the look-up costs.
         self.rows = np.ascontiguousarray(coefficients.reshape(2, n, n, -1).transpose(0, 2, 3, 1))
+
+    @property
+    def x_range(self):
+        """First and last edge along x."""
+        return self.x_low, self.x_high
+
+    @property
+    def y_range(self):
+        """First and last edge along y."""
+        return self.y_low, self.y_high
 
     def clip(self, x, y, margin=0.0):
         """Move points outside the grid onto its rim, or onto a margin around it, in place."""
@@ -256,47 +274,68 @@ class CellGrid:
 
     def evaluate(self, cell, s, t):
         """Return both outputs."""
+        outputs = [np.empty_like(s), np.empty_like(s)]
         n = self.rows.shape[1]
-        wide_t, total, part = _scratch.get((3, len(s), n))
-        wide_t[:] = np.repeat(t, n).reshape(-1, n)
-        outputs = []
-        for rows in self.rows:
-            rows[n - 1].take(cell, axis=0, out=total, mode="clip")
-            for q in range(n - 2, -1, -1):
-                total *= wide_t
-                rows[q].take(cell, axis=0, out=part, mode="clip")
-                total += part
-            outputs.append(_horner_columns(total, s))
+        for part in _parts(len(s)):
+            wide_t, total, term = _scratch.get((3, part.stop - part.start, n))
+            for column in wide_t.T:
+                column[:] = t[part]
+            for rows, output in zip(self.rows, outputs, strict=True):
+                rows[n - 1].take(cell[part], axis=0, out=total, mode="clip")
+                for q in range(n - 2, -1, -1):
+                    total *= wide_t
+                    rows[q].take(cell[part], axis=0, out=term, mode="clip")
+                    total += term
+                _horner_columns(total, s[part], output[part])
         return outputs
 
     def evaluate_jacobian(self, cell, s, t):
         """Return both outputs and their derivatives, ``(a, b), (a_x, a_y, b_x, b_y)``."""
+        results = [[np.empty_like(s) for _ in range(3)] for _ in range(2)]
         n = self.rows.shape[1]
-        wide_t, total, slope, part = _scratch.get((4, len(s), n))
-        wide_t[:] = np.repeat(t, n).reshape(-1, n)
-        outputs, derivatives = [], []
-        for rows in self.rows:
-            rows[n - 1].take(cell, axis=0, out=total, mode="clip")
-            for q in range(n - 2, -1, -1):
-                if q == n - 2:
-                    slope[:] = total
-                else:
-                    slope *= wide_t
-                    slope += total
-                total *= wide_t
-                rows[q].take(cell, axis=0, out=part, mode="clip")
-                total += part
-            value, by_s = _horner_columns(total, s, derivative=True)
-            by_t = _horner_columns(slope, s)
+        for part in _parts(len(s)):
+            wide_t, total, slope, term = _scratch.get((4, part.stop - part.start, n))
+            for column in wide_t.T:
+                column[:] = t[part]
+            for rows, (value, by_s, by_t) in zip(self.rows, results, strict=True):
+                rows[n - 1].take(cell[part], axis=0, out=total, mode="clip")
+                for q in range(n - 2, -1, -1):
+                    if q == n - 2:
+                        slope[:] = total
+                    else:
+                        slope *= wide_t
+                        slope += total
+                    total *= wide_t
+                    rows[q].take(cell[part], axis=0, out=term, mode="clip")
+                    total += term
+                _horner_columns(total, s[part], value[part], by_s[part])
+                _horner_columns(slope, s[part], by_t[part])
+        for _, by_s, by_t in results:
             by_s *= 1.0 / self.x_step
             by_t *= 1.0 / self.y_step
-            outputs.append(value)
-            derivatives += [by_s, by_t]
-        return outputs, derivatives
+        return [result[0] for result in results], [d for result in results for d in result[1:]]
 
-    def negated(self):
-        """Return the grid with both outputs negated."""
-        return CellGrid((self.x_low, self.x_high), (self.y_low, self.y_high), -self.coefficients)
+    def transformed(self, matrix, offset=(0.0, 0.0)):
+        """Return the grid with its outputs (a, b) replaced by ``matrix @ (a, b) + offset``."""
+        coefficients = np.einsum("ij,j...->i...", matrix, self.coefficients)
+        coefficients[:, 0, 0] += np.reshape(offset, (2, 1, 1))
+        return CellGrid(self.x_range, self.y_range, coefficients, smooth=self.smooth)
+
+    def curvature(self):
+        """Return a bound M of the second derivatives.
+
+        A step (dx, dy) of Newton's method leaves a residual of at most ``M (dx**2 + dy**2) / 2`` in
+        either output.  Infinite where the first derivatives jump from cell to cell.
+        """
+        if not self.smooth:
+            return np.inf
+        n = self.rows.shape[1]
+        p, q = np.arange(n)[:, np.newaxis, np.newaxis, np.newaxis], np.arange(n)[:, None, None]
+        size = np.abs(self.coefficients)
+        along_x = (size * p * (p - 1)).sum(axis=(1, 2)).max() / self.x_step**2
+        along_y = (size * q * (q - 1)).sum(axis=(1, 2)).max() / self.y_step**2
+        mixed = (size * p * q).sum(axis=(1, 2)).max() / (self.x_step * self.y_step)
+        return max(along_x, along_y) + mixed
 
     def fold(self, polynomial, origin):
         """Return a grid of bicubic cells with a polynomial of degree 3 or less added.
@@ -330,7 +369,7 @@ class CellGrid:
         total = np.zeros((2, 4, 4, self.ny, self.nx))
         total[:, :n, :n] += self.coefficients
         total[:, :m, :m] += local
-        return CellGrid((self.x_low, self.x_high), (self.y_low, self.y_high), total)
+        return CellGrid(self.x_range, self.y_range, total, smooth=self.smooth)
 
 
 def spline_cells(x_grid, y_grid, values):
@@ -358,7 +397,7 @@ def spline_cells(x_grid, y_grid, values):
     y_scale = (y_grid[1] - y_grid[0]) ** np.arange(4)
     scale = x_scale[:, np.newaxis] * y_scale
     coefficients = coefficients * scale[..., np.newaxis, np.newaxis]
-    return CellGrid(x_grid[[0, -1]], y_grid[[0, -1]], coefficients)
+    return CellGrid(x_grid[[0, -1]], y_grid[[0, -1]], coefficients, smooth=True)
 
 
 class PlaneMap:
@@ -390,9 +429,39 @@ class PlaneMap:
         self.radial = radial
         self.radial_matrix = np.eye(2) if radial_matrix is None else radial_matrix
         self.grid = grid
+        # Only cells alone have a bound of their second derivatives at hand.
+        self._curvature = np.inf if grid is None or polynomial is not None else grid.curvature()
         self._start_fit = self._start_range = self._start_spline = self._middle_sign = None
         if polynomial is not None:
             self.derivatives = [(_derivative(c, 0), _derivative(c, 1)) for c in polynomial]
+
+    def transformed(self, matrix, offset=(0.0, 0.0)):
+        """Return the map followed by a linear one, ``matrix @ (a, b) + offset``.
+
+        Parameters
+        ----------
+        matrix : (2, 2) ndarray
+            Applied to the images.
+        offset : (float, float), optional
+            Added to them.
+
+        Returns
+        -------
+        plane_map : PlaneMap
+            The map from (x, y) to the transformed images.
+        """
+        polynomial, radial, grid = self.polynomial, self.radial, self.grid
+        if polynomial is not None:
+            polynomial = np.einsum("ij,jpq->ipq", matrix, polynomial)
+            polynomial[:, 0, 0] += offset
+            offset = (0.0, 0.0)
+        if radial is not None:
+            radial = matrix @ radial
+        if grid is not None:
+            grid = grid.transformed(matrix, offset)
+        return PlaneMap(
+            polynomial, self.origin, radial=radial, radial_matrix=self.radial_matrix, grid=grid
+        )
 
     def _radius(self, u, v):
         m = self.radial_matrix
@@ -499,7 +568,7 @@ class PlaneMap:
         Returns
         -------
         x, y : (N,) ndarray
-            The points, each verified by its residual; NaN where there is none.
+            The points, each verified by its residual or a bound of it; NaN where there is none.
 
         Notes
         -----
@@ -527,16 +596,13 @@ class PlaneMap:
             return np.empty(0), np.empty(0)
         x, y = self._start(a, b) if start is None else (value.copy() for value in start)
         self._clip(x, y, margin)
-        x, y, determinant = self._newton_step(a, b, x, y, margin)
-        residual = self._residual(a, b, x, y, margin)
+        x_new, y_new, determinant, residual = self._newton_step(a, b, x, y, tolerance, margin)
         if residual.max() <= tolerance and determinant.min() > 0:
-            return x, y
+            return x_new, y_new
         # The points that are not done go on by themselves.  Rounding of the map sets the floor.
         limit = tolerance + 16 * np.finfo(float).eps * np.maximum(np.abs(a), np.abs(b))
         x_out, y_out = np.full(a.shape, np.nan), np.full(a.shape, np.nan)
         index = np.arange(len(a))
-        x_new, y_new = x, y
-        x = y = np.full(a.shape, np.nan)
         for _ in range(_MAX_NEWTON):
             done = residual <= limit
             answer = done & (determinant > 0)
@@ -550,8 +616,7 @@ class PlaneMap:
                 break
             a, b, limit, index = a[going], b[going], limit[going], index[going]
             x, y = x_new[going], y_new[going]
-            x_new, y_new, determinant = self._newton_step(a, b, x, y, margin)
-            residual = self._residual(a, b, x_new, y_new, margin)
+            x_new, y_new, determinant, residual = self._newton_step(a, b, x, y, tolerance, margin)
         return x_out, y_out
 
     def _residual(self, a, b, x, y, margin):
@@ -563,8 +628,8 @@ class PlaneMap:
         np.abs(fb, out=fb)
         return np.maximum(fa, fb, out=fa)
 
-    def _newton_step(self, a, b, x, y, margin):
-        """Return the next iterate and the determinant at the present one, negative in a fold."""
+    def _newton_step(self, a, b, x, y, tolerance, margin):
+        """Return the next iterate, its residual, and the determinant here, negative in a fold."""
         (fa, fb), (a_x, a_y, b_x, b_y) = self.jacobian(x, y, margin)
         np.subtract(a, fa, out=fa)
         np.subtract(b, fb, out=fb)
@@ -574,16 +639,35 @@ class PlaneMap:
         a_y *= fb
         b_y -= a_y
         b_y /= determinant
-        b_y += x
         a_x *= fb
         b_x *= fa
         a_x -= b_x
         a_x /= determinant
-        a_x += y
-        self._clip(b_y, a_x, margin)
+        x_new, y_new = x + b_y, y + a_x
+        # What a step leaves is bounded by its length; where the bound is good enough for every
+        # point, the map need not be evaluated again.
+        residual = b_y
+        residual *= b_y
+        a_x *= a_x
+        residual += a_x
+        residual *= 0.5 * self._curvature
+        certain = residual.max() <= tolerance and self._inside(x_new, y_new, margin)
+        if not certain:
+            self._clip(x_new, y_new, margin)
+            residual = self._residual(a, b, x_new, y_new, margin)
         if self._orientation() < 0:
             np.negative(determinant, out=determinant)
-        return b_y, a_x, determinant
+        return x_new, y_new, determinant, residual
+
+    def _inside(self, x, y, margin):
+        x_low, x_high = self.grid.x_range
+        y_low, y_high = self.grid.y_range
+        return (
+            x.min() >= x_low - margin
+            and x.max() <= x_high + margin
+            and y.min() >= y_low - margin
+            and y.max() <= y_high + margin
+        )
 
     def _orientation(self):
         """Return the sign of the Jacobian determinant in the middle, -1 for a mirror."""

@@ -229,6 +229,8 @@ class TangentSky(_Linear):
 
     _to_sky = True
 
+    _cache = None
+
     def evaluate(self, x, y, crpix, cd, crval):
         """Map undistorted pixels to the sky.
 
@@ -261,6 +263,23 @@ class TangentSky(_Linear):
             return tangent.deproject_radians(xi, v)
 
         return to_sky
+
+    def _after(self, plane_map):
+        """Return a map to the tangent plane in radians, the linear part folded in, and the rest.
+
+        The map is kept for as long as it is asked for with the same map and the same parameters.
+        """
+        crpix, cd, crval = self.crpix.value, self.cd.value, self.crval.value
+        numbers = np.concatenate([crpix, np.ravel(cd)])
+        cache = self._cache
+        if cache is None or cache[0] is not plane_map or not np.array_equal(cache[1], numbers):
+            matrix = np.radians(cd)
+            cache = (plane_map, numbers, plane_map.transformed(matrix, -matrix @ crpix))
+            self._cache = cache
+        return cache[2], _Tangent(crval).deproject_radians
+
+    def __getstate__(self):
+        return {**self.__dict__, "_cache": None}
 
     @property
     def inverse(self):
