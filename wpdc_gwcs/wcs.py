@@ -5,6 +5,7 @@
     detector (px) --DistortionCorrection--> undistorted (px) --TangentSky--> icrs (deg)
 """
 
+import math
 import os
 
 import numpy as np
@@ -26,7 +27,7 @@ from gwcs import WCS
 from gwcs import coordinate_frames as cf
 
 from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, TangentSky
-from wpdc_gwcs.models.blocks import evaluate_blocks, run_blocks
+from wpdc_gwcs.models.blocks import THREADED_BLOCK_SIZE, evaluate_blocks, run_blocks
 from wpdc_gwcs.models.mapping import PlaneMap, fit_polynomial
 
 __all__ = ["DetectorWCS", "build_wcs", "sky_map", "to_stock_wcs"]
@@ -272,20 +273,33 @@ def sky_map(wcs, *, image_shape=None, out=None):
         if array.shape != (ny, nx):
             raise ValueError(f"out must hold two arrays of the shape {(ny, nx)}, not {array.shape}")
     transform = wcs.forward_transform
-    if isinstance(transform, DetectorToSky):
-        # Without the overhead of a model call for each block.
-        transform = transform.block_function()
     columns = np.arange(nx, dtype=float)
+    # Threads take bands of rows, in pieces that stay in the cache.
+    band = max(1, _BAND_SIZE // nx)
+    step = max(1, THREADED_BLOCK_SIZE // nx)
 
-    def fill(start, stop):
-        n_rows = stop - start
-        x = np.tile(columns, n_rows)
-        y = np.repeat(np.arange(start, stop, dtype=float), nx)
-        for array, values in zip((ra, dec), transform(x, y), strict=True):
-            array[start:stop] = values.reshape(n_rows, nx)
+    def fill(first, last):
+        if isinstance(transform, DetectorToSky):
+            function = transform.row_function(columns)
+        else:
+            function = _any_rows(transform, columns)
+        with np.errstate(all="ignore"):
+            for start in range(first * band, min(last * band, ny), step):
+                stop = min(start + step, last * band, ny)
+                values = function(np.arange(start, stop, dtype=float))
+                ra[start:stop], dec[start:stop] = values
 
-    run_blocks(fill, ny, weight=nx)
+    run_blocks(fill, math.ceil(ny / band), weight=band * nx)
     return ra, dec
+
+
+# Pixels in a band of rows.
+_BAND_SIZE = 524_288
+
+
+def _any_rows(transform, x):
+    """Return a function for whole rows of any transform."""
+    return lambda y: transform(*np.broadcast_arrays(x, y[:, np.newaxis]))
 
 
 def to_stock_wcs(wcs):

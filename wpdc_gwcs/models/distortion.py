@@ -328,6 +328,12 @@ class DetectorToSky(Model):
             ``function(x, y) -> ra, dec``.
         """
         to_plane, deproject = self.sky._after(self.distortion._plane_map())
+        grid = to_plane.grid
+        if box is not None and grid is not None and np.isnan(fill_value):
+            # What is outside the grid is NaN as it is.
+            edges = (grid.x_range, grid.y_range)
+            if all(e[0] >= b[0] and e[1] <= b[1] for e, b in zip(edges, box, strict=True)):
+                box = None
         if box is None:
             return lambda x, y: deproject(*to_plane(x, y))
         (x_low, x_high), (y_low, y_high) = box
@@ -344,6 +350,23 @@ class DetectorToSky(Model):
             return ra, dec
 
         return function
+
+    def row_function(self, x):
+        """Return the map as a function of whole rows of an image.
+
+        Parameters
+        ----------
+        x : (N,) ndarray
+            Positions along a row.
+
+        Returns
+        -------
+        function : callable
+            ``function(y) -> ra, dec`` for M rows, each (M, N).
+        """
+        to_plane, deproject = self.sky._after(self.distortion._plane_map())
+        rows = to_plane.along_rows(x)
+        return lambda y: deproject(*rows(y))
 
     @property
     def inverse(self):

@@ -162,9 +162,9 @@ def _horner_columns(columns, s, total, slope=None):
         total += columns[:, p]
 
 
-# Points whose four coefficients are worked on at a time: they and their kin stay in a core's
-# second-level cache, whatever the length of a block.
-_PART_SIZE = 16384
+# Points whose four coefficients are worked on at a time, a compromise: fewer stay closer to the
+# core, more keep threads from waiting for each other.
+_PART_SIZE = 32768
 
 
 def _parts(n):
@@ -288,6 +288,14 @@ class CellGrid:
                     total += term
                 _horner_columns(total, s[part], output[part])
         return outputs
+
+    def collapse(self, cell, s):
+        """Return the coefficients ``[k][q]`` of the powers of t that are left when s is given."""
+        coefficients = np.empty((2, self.rows.shape[1], len(s)))
+        for rows, outputs in zip(self.rows, coefficients, strict=True):
+            for row, output in zip(rows, outputs, strict=True):
+                _horner_columns(row.take(cell, axis=0), s, output)
+        return coefficients
 
     def evaluate_jacobian(self, cell, s, t):
         """Return both outputs and their derivatives, ``(a, b), (a_x, a_y, b_x, b_y)``."""
@@ -502,6 +510,57 @@ class PlaneMap:
                 a[outside] = np.nan
                 b[outside] = np.nan
         return a, b
+
+    def along_rows(self, x):
+        """Return a function for the rows of an image, which have much in common.
+
+        Parameters
+        ----------
+        x : (N,) ndarray
+            Positions along a row.
+
+        Returns
+        -------
+        function : callable
+            ``function(y)`` returns the images ``a, b`` of the points of M rows, each (M, N).  It is
+            quickest when the rows come in order.
+        """
+        if self.grid is None or self.polynomial is not None:
+
+            def function(y):
+                points = np.tile(x, len(y)), np.repeat(y, len(x))
+                return tuple(value.reshape(len(y), len(x)) for value in self(*points))
+
+            return function
+        grid = self.grid
+        low = np.full(1, grid.y_low)
+        x_cell, s, _, x_outside = grid.locate(x, np.broadcast_to(low, x.shape))
+        cache = {}
+
+        def function(y):
+            cell, _, t, y_outside = grid.locate(np.full(len(y), grid.x_low), y)
+            a, b = np.empty((2, len(y), len(x)))
+            for first in np.unique(cell):
+                if first not in cache:
+                    cache.clear()
+                    cache[first] = grid.collapse(first + x_cell, s)
+                rows = cell == first
+                t_rows = t[rows, np.newaxis]
+                for output, (*lower, highest) in zip((a, b), cache[first], strict=True):
+                    value = highest * t_rows
+                    for coefficient in lower[:0:-1]:
+                        value += coefficient
+                        value *= t_rows
+                    value += lower[0]
+                    output[rows] = value
+            for output in (a, b):
+                if x_outside is not None:
+                    output[:, x_outside] = np.nan
+                if y_outside is not None:
+                    output[y_outside] = np.nan
+            return a, b
+
+        return function
 
     def jacobian(self, x, y, margin=0.0):
         """Map a block of points and differentiate.

@@ -62,16 +62,23 @@ class _Tangent:
         north = eta
         north *= self.cos0
         north += self.sin0
-        ra = np.arctan2(xi, ahead)
+        if xi.size and ahead.min() > 0:
+            # Of one argument it is the faster one.
+            ra = xi / ahead
+            np.arctan(ra, out=ra)
+        else:
+            ra = np.arctan2(xi, ahead)
         xi *= xi
         ahead *= ahead
         xi += ahead
         np.sqrt(xi, out=xi)
-        dec = np.arctan2(north, xi, out=north)
+        # At the pole itself it is the arc tangent of infinity.
+        north /= xi
+        dec = np.arctan(north, out=north)
         dec *= 180 / np.pi
         ra *= 180 / np.pi
         ra += self.ra0
-        if len(ra) and not (ra.min() >= 0.0 and ra.max() < 360.0):
+        if ra.size and not (ra.min() >= 0.0 and ra.max() < 360.0):
             np.mod(ra, 360.0, out=ra)
             # A tiny negative angle is rounded up to 360 by the modulus.
             ra[ra == 360.0] = 0.0
