@@ -365,12 +365,11 @@ _LOW_RANK_TOLERANCE = 1e-11
 # Smoothings tried, in units of the largest eigenvalue: from following every bin to all but none.
 _SMOOTHINGS = 10.0 ** np.arange(-10.0, 3.01, 0.5)
 
-# Nodes of the pilot surface along each axis: twice as dense as the table's for the paper's
-# detector.
-_PILOT_NODES = 71
+# Nodes of the pilot surface along each axis.
+_PILOT_NODES = 51
 
 # Candidates that go from generalised cross-validation on to cross-validation over exposures.
-_N_SHORTLIST = 5
+_N_SHORTLIST = 4
 
 # Fewer stars than this do not carry a table.
 _MIN_STARS_TABLE = 60

@@ -1,0 +1,500 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from numpy.testing import assert_allclose
+
+from wpdc_gwcs import RadialWeight, build_wcs
+from wpdc_gwcs.exceptions import FitError
+from wpdc_gwcs.instrument import Exposure, solve_instrument
+from wpdc_gwcs.models import deproject, project
+from wpdc_gwcs.solution import Calibration
+
+SHAPE = (2000, 2048)
+CRPIX = np.array([1023.5, 999.5])
+CD = 2e-5 * np.array([[-1.0, 0.03], [0.03, 1.0]])
+NOISE = 0.05
+WEIGHT = RadialWeight("exp-sqrt", r0=900.0)
+
+
+def cubic(x, y):
+    """Distortion of 12 px at the corners that a cubic describes, without linear part."""
+    u, v = (x - CRPIX[0]) / 1024, (y - CRPIX[1]) / 1024
+    return 3 * u * (u * u + v * v) + u * v, 3 * v * (u * u + v * v) - 2 * u * u
+
+
+def smooth(x, y):
+    """The same with structure that no cubic takes: 0.5 px at the corners."""
+    u, v = (x - CRPIX[0]) / 1024, (y - CRPIX[1]) / 1024
+    dx, dy = cubic(x, y)
+    return dx + 0.5 * u**3 * v**2, dy - 0.4 * u**5 + 0.1 * np.sin(4 * v)
+
+
+class Field:
+    """Exposures of one detector whose truth is known."""
+
+    def __init__(
+        self,
+        rng,
+        n=5,
+        stars=400,
+        distortion=smooth,
+        noise=NOISE,
+        cds=None,
+        crval=(40.0, 20.0),
+        dither=0.005,
+    ):
+        self.distortion = distortion
+        self.cds = [CD] * n if cds is None else cds
+        ra = crval[0] + dither * rng.normal(size=n) / np.cos(np.radians(crval[1]))
+        self.crvals = np.stack([ra % 360, crval[1] + dither * rng.normal(size=n)], axis=1)
+        self.exposures = []
+        for k, (true_cd, true_crval) in enumerate(zip(self.cds, self.crvals)):
+            x, y = rng.uniform(0, SHAPE[1] - 1, stars), rng.uniform(0, SHAPE[0] - 1, stars)
+            ra, dec = self.sky(k, x, y)
+            error = rng.uniform(0.6, 1.4, stars) * noise
+            x, y = x + rng.normal(size=stars) * error, y + rng.normal(size=stars) * error
+            start = np.array(deproject(2e-4, -1e-4, true_crval))
+            if noise == 0:
+                error = None
+            self.exposures.append(
+                Exposure(
+                    f"e{k}",
+                    x,
+                    y,
+                    ra,
+                    dec,
+                    start,
+                    true_cd @ [[1.002, 0.003], [-0.003, 1.002]],
+                    error,
+                    error,
+                )
+            )
+
+    def sky(self, k, x, y):
+        dx, dy = self.distortion(x, y)
+        return deproject(*(self.cds[k] @ [x + dx - CRPIX[0], y + dy - CRPIX[1]]), self.crvals[k])
+
+    def errors(self, result, k, n=41):
+        """Error of exposure k on a grid over the detector, (2, n, n) px along the true axes."""
+        x, y = np.meshgrid(np.linspace(0, SHAPE[1] - 1, n), np.linspace(0, SHAPE[0] - 1, n))
+        sky = wcs_of(result, k)(x, y)
+        dx, dy = self.distortion(x, y)
+        place = np.tensordot(
+            np.linalg.inv(self.cds[k]), np.array(project(*sky, self.crvals[k])), axes=1
+        )
+        return place - [x + dx - CRPIX[0], y + dy - CRPIX[1]]
+
+    def rms(self, result):
+        kept = [k for k, f in enumerate(result.exposures) if f.reason is None]
+        return float(
+            np.sqrt(np.mean([np.sum(self.errors(result, k) ** 2, axis=0).mean() for k in kept]))
+        )
+
+    def solve(self, **options):
+        # Without a table a masking weight would make the corners an extrapolation.
+        weight = RadialWeight("uniform") if options.get("lut") == "none" else WEIGHT
+        return solve_instrument(
+            self.exposures, image_shape=SHAPE, crpix=CRPIX, **{"weight": weight, **options}
+        )
+
+
+def corner(rng, stars, size):
+    """One exposure whose stars are all in one corner."""
+    field = Field(rng, n=1, stars=10)
+    x, y = rng.uniform(0, size, (2, stars))
+    ra, dec = field.sky(0, x, y)
+    error = np.full(stars, NOISE)
+    x, y = x + rng.normal(size=stars) * error, y + rng.normal(size=stars) * error
+    old = field.exposures[0]
+    field.exposures = [Exposure("e0", x, y, ra, dec, old.crval, old.cd, error, error)]
+    return field
+
+
+def wcs_of(result, k):
+    fit, s = result.exposures[k], result.solution
+    return build_wcs(
+        crpix=s.crpix, cd=fit.cd, crval=fit.crval, pv=fit.pv or s.pv, pv_cd=s.cd, lookup_table=s.lookup_table,
+        image_shape=s.image_shape,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def solved():
+    field = Field(np.random.default_rng(3), n=6)
+    return field, field.solve(detector="det-1")
+
+
+class TestInstrument:
+    @pytest.mark.parametrize("n", [1, 4])
+    def test_noise_free_cubic_is_recovered(self, rng, n):
+        field = Field(rng, n=n, distortion=cubic, noise=0)
+        result = field.solve(lut="none")
+        # Iterated until no exposure moves by 1e-4 px.
+        assert field.rms(result) < 1e-4
+        for fit, crval in zip(result.exposures, field.crvals):
+            assert_allclose(fit.crval, crval, atol=1e-4 * 2e-5 * 5, rtol=0)
+            assert_allclose(fit.cd, CD, atol=1e-9 * 2e-5 * 1e3, rtol=0)
+
+    def test_gauge(self, solved):
+        """CRVAL is the sky at CRPIX and CD the local scale there, but for the table."""
+        _, result = solved
+        coefficients = result.solution.pv.coefficients
+        assert_allclose(coefficients[:, :3], [[0, 1, 0], [0, 1, 0]], atol=1e-15)
+        fit = result.exposures[0]
+        wcs = build_wcs(
+            crpix=CRPIX,
+            cd=fit.cd,
+            crval=fit.crval,
+            pv=result.solution.pv,
+            pv_cd=result.solution.cd,
+            image_shape=SHAPE,
+        )
+        assert_allclose(wcs(*CRPIX), fit.crval, atol=1e-12)
+
+    def test_reaches_the_floor(self, solved):
+        field, result = solved
+        # Attitude, two common numbers of six pooled: 0.05 sqrt((4 + 4 ... 12) / 400); table: about 0.05 sqrt(60 / 2400).
+        assert field.rms(result) < 0.010
+        assert result.solution.detector == "det-1"
+        assert result.rejected == {}
+        assert result.solution.lookup_table is not None
+        assert_allclose(result.solution.statistics["error_scale"], 1.0, atol=0.1)
+        assert result.solution.residual_map.n_stars > 0.98 * 6 * 400
+
+    def test_uncertainty_is_honest(self, solved):
+        field, result = solved
+        pulls = []
+        for k, fit in enumerate(result.exposures):
+            frame = Calibration(fit.name, result.solution, fit.crval, fit.cd, fit.covariance)
+            x, y = np.meshgrid(np.linspace(0, SHAPE[1] - 1, 41), np.linspace(0, SHAPE[0] - 1, 41))
+            sigma_x, sigma_y, _ = frame.uncertainty(x, y)
+            pulls += [field.errors(result, k)[0] / sigma_x, field.errors(result, k)[1] / sigma_y]
+        assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.4
+
+    def test_held_out_stars(self, rng):
+        """They are predicted with the promised error, and have no influence at all."""
+        field = Field(rng, n=5)
+        use = rng.uniform(size=400) > 0.2
+        field.exposures = [replace(e, use=use) for e in field.exposures]
+        result = field.solve()
+        pulls = []
+        for e, fit in zip(field.exposures, result.exposures):
+            frame = Calibration(fit.name, result.solution, fit.crval, fit.cd, fit.covariance)
+            sigma = frame.uncertainty(e.x, e.y)[:2]
+            assert not np.any(fit.used[~use])
+            pulls += [
+                (fit.dx / np.hypot(fit.x_err, sigma[0]))[~use], (fit.dy / np.hypot(fit.y_err, sigma[1]))[~use]
+            ]  # fmt: skip
+        # 400 stars, two axes: 2.5 %.
+        assert 0.9 < np.std(pulls) < 1.1
+        moved = [replace(e, x=np.where(use, e.x, e.x + 3)) for e in field.exposures]
+        again = solve_instrument(moved, image_shape=SHAPE, crpix=CRPIX, weight=WEIGHT)
+        assert_allclose(again.exposures[2].crval, result.exposures[2].crval, rtol=0, atol=1e-13)
+        assert_allclose(again.solution.lookup_table.dx, result.solution.lookup_table.dx, atol=1e-12)
+
+    @pytest.mark.parametrize("crval", [(0.0, -45.0), (123.0, 89.99)])
+    def test_sky_is_round(self, rng, crval):
+        field = Field(rng, n=3, crval=crval, distortion=cubic)
+        result = field.solve(lut="none")
+        assert field.rms(result) < 0.02
+        separation = project(*result.solution.crval, crval)
+        assert np.hypot(*separation) < 0.02
+
+    def test_swapped_axes_and_given_cd(self, rng):
+        swapped = 2e-5 * np.array([[0.0, 1.0], [1.0, 0.0]])
+        field = Field(rng, n=2, cds=[swapped] * 2, distortion=cubic)
+        nominal = swapped @ [[1.001, 0.0], [0.002, 0.999]]
+        result = field.solve(lut="none", cd=nominal)
+        assert_allclose(result.solution.cd, nominal)
+        assert field.rms(result) < 0.015
+
+    def test_errors_per_axis(self, rng):
+        """A star that is well measured along one axis only."""
+        field = Field(rng, n=2, distortion=cubic)
+        exposures = []
+        for e in field.exposures:
+            bad = np.arange(400) < 200
+            y = e.y + np.where(bad, rng.normal(0, 2, 400), 0)
+            exposures.append(replace(e, y=y, y_err=np.where(bad, 2.0, e.y_err)))
+        field.exposures = exposures
+        assert field.rms(field.solve(lut="none")) < 0.015
+
+    def test_degree_and_weights(self, rng):
+        field = Field(rng, n=2, noise=0, distortion=lambda x, y: (2e-13 * (x - 1000) ** 4, 0 * y))
+        result = field.solve(lut="none", degree=4)
+        assert result.solution.pv.degree == 4
+        assert field.rms(result) < 1e-4
+        uniform = solve_instrument(
+            field.exposures, image_shape=SHAPE, lut="none", weight=RadialWeight("uniform")
+        )
+        assert uniform.solution.settings["weight"] == "uniform"
+        assert uniform.solution.pv.degree == 3
+        assert_allclose(uniform.solution.crpix, [1023.5, 999.5])
+
+
+class TestAttitudes:
+    def test_pooling_helps_where_attitudes_agree(self, rng):
+        field = Field(rng, n=8, stars=100, distortion=cubic)
+        pooled, free = field.solve(lut="none"), field.solve(lut="none", pool_attitudes=False)
+        assert field.rms(pooled) < 0.85 * field.rms(free)
+        variation = pooled.solution.statistics["attitude_variation"]
+        assert set(variation) == {"scale", "rotation", "stretch", "shear"}
+
+    def test_pooling_does_not_bend_real_differences(self, rng):
+        cds = [CD @ (np.eye(2) + 1e-3 * rng.normal(size=(2, 2))) for _ in range(8)]
+        field = Field(rng, n=8, stars=100, distortion=cubic, cds=cds)
+        pooled, free = field.solve(lut="none"), field.solve(lut="none", pool_attitudes=False)
+        assert field.rms(pooled) < 1.02 * field.rms(free)
+        assert_allclose(pooled.solution.statistics["attitude_variation"]["scale"], 1e-3, rtol=0.8)
+
+    @pytest.mark.parametrize("stars", [20, 100])
+    def test_new_exposure_of_a_stored_solution(self, solved, rng, stars):
+        _, stored = solved
+        field = Field(rng, n=2, stars=stars)
+        result = field.solve(solution=stored.solution)
+        assert result.solution is stored.solution
+        # Three numbers per axis from the stars, and the error of the instrument.
+        assert field.rms(result) < 0.01 + 2 * NOISE * np.sqrt(6 / stars)
+
+    def test_stored_solution_of_another_detector(self, solved, rng):
+        field = Field(rng, n=1)
+        with pytest.raises(FitError, match=r"\(2000, 2048\) px.*\(1000, 1000\)"):
+            solve_instrument(field.exposures, image_shape=(1000, 1000), solution=solved[1].solution)
+
+    def test_too_few_stars_for_an_attitude(self, solved, rng):
+        field = Field(rng, n=1, stars=9)
+        with pytest.raises(FitError, match="exposure e0: 9 of 9 stars"):
+            field.solve(solution=solved[1].solution)
+
+    def test_attitude_from_a_corner(self, solved, rng):
+        field = corner(rng, 40, 60.0)
+        with pytest.raises(FitError, match="far corner of the detector uncertain by"):
+            field.solve(solution=solved[1].solution)
+
+
+class TestUpdate:
+    def test_merges_residuals(self, solved, rng):
+        field, stored = solved
+        new = Field(rng, n=6)
+        result = new.solve(solution=stored.solution, update=True)
+        before, after = stored.solution.residual_map, result.solution.residual_map
+        assert after.n_stars - before.n_stars == sum(f.used.sum() for f in result.exposures)
+        assert np.nanmean(result.solution.table_sigma[0]) < np.nanmean(
+            stored.solution.table_sigma[0]
+        )
+        assert new.rms(result) < 0.010
+        assert_allclose(result.solution.pv.parameters, stored.solution.pv.parameters)
+        # The stored one is not touched.
+        assert stored.solution.residual_map.n_stars == before.n_stars
+
+    def test_needs_a_stored_map(self, solved, rng):
+        bare = replace(solved[1].solution, residual_map=None)
+        with pytest.raises(FitError, match="holds no residual map"):
+            Field(rng, n=2).solve(solution=bare, update=True)
+        with pytest.raises(ValueError, match="update needs a stored solution"):
+            Field(rng, n=2).solve(update=True)
+
+
+class TestRefine:
+    def test_own_polynomials(self, rng):
+        field = Field(rng, n=3, stars=600)
+        result = field.solve(refine="pv")
+        assert all(f.pv is not None for f in result.exposures)
+        assert_allclose([f.pv.pv1_1.value for f in result.exposures], 1.0)
+        assert result.exposures[0].pv_covariance.shape == (2, 10, 10)
+        # The star noise of one exposure, extrapolated from r0 to the corners: worse, as the paper's way is.
+        shared = field.solve()
+        assert field.rms(shared) < field.rms(result) < 0.15
+
+    def test_auto_keeps_what_predicts(self, rng):
+        assert Field(rng, n=3, stars=300).solve(refine="auto").exposures[0].pv is None
+
+    def test_auto_follows_an_unstable_instrument(self, rng):
+        field = Field(rng, n=4, stars=600, distortion=cubic)
+        other = Field(rng, n=4, stars=600, distortion=lambda x, y: [1.3 * d for d in cubic(x, y)])
+        mixed = [
+            *field.exposures[:2],
+            *(replace(e, name="o" + e.name) for e in other.exposures[:2]),
+        ]
+        result = solve_instrument(
+            mixed,
+            image_shape=SHAPE,
+            crpix=CRPIX,
+            weight=RadialWeight("uniform"),
+            lut="none",
+            refine="auto",
+        )
+        assert all(f.pv is not None for f in result.exposures)
+        assert max(f.statistics["scatter_dx"] for f in result.exposures) < 1.3 * NOISE
+
+
+class TestRobustness:
+    def test_wrong_pairs(self, rng):
+        field = Field(rng, n=5)
+        for e in field.exposures:
+            e.x[:8] += rng.normal(0, 8, 8)
+            e.y[:8] += rng.normal(0, 8, 8)
+        result = field.solve()
+        assert field.rms(result) < 0.012
+        assert np.mean([f.used[:8].mean() for f in result.exposures]) < 0.15
+
+    def test_exposure_with_wrong_matches_is_named(self, rng):
+        field = Field(rng, n=8, stars=300, distortion=cubic)
+        e = field.exposures[5]
+        shuffled = rng.permutation(300)
+        field.exposures[5] = replace(e, ra=e.ra[shuffled], dec=e.dec[shuffled])
+        result = field.solve(lut="none")
+        assert list(result.rejected) == ["e5"]
+        assert "wrong pairs" in result.rejected["e5"]
+        assert_allclose(result.exposures[5].crval, e.crval)
+        assert not result.exposures[5].used.any()
+        assert field.rms(result) < 0.012
+
+    def test_alone_with_wrong_matches(self, rng):
+        field = Field(rng, n=1, stars=300)
+        e = field.exposures[0]
+        field.exposures = [replace(e, ra=e.ra[::-1], dec=e.dec[::-1])]
+        with pytest.raises(
+            FitError, match="exposure e0: its residuals scatter by .* px: wrong pairs"
+        ):
+            field.solve()
+
+    def test_exposure_of_another_sky(self, rng):
+        field = Field(rng, n=3, distortion=cubic)
+        field.exposures[1] = replace(field.exposures[1], crval=np.array([250.0, -70.0]))
+        result = field.solve(lut="none")
+        assert list(result.rejected) == ["e1"]
+
+    @pytest.mark.parametrize("scale", [0.3, 3.0])
+    def test_wrong_scale_of_the_errors(self, rng, scale):
+        field = Field(rng, n=3, distortion=cubic)
+        field.exposures = [
+            replace(e, x_err=e.x_err * scale, y_err=e.y_err * scale) for e in field.exposures
+        ]
+        result = field.solve(lut="none")
+        assert_allclose(result.solution.statistics["error_scale"], 1 / scale, rtol=0.1)
+        assert_allclose(np.median(result.exposures[0].x_err), NOISE, rtol=0.1)
+
+    def test_unknown_errors(self, rng):
+        field = Field(rng, n=3, distortion=cubic)
+        field.exposures = [replace(e, x_err=None, y_err=None) for e in field.exposures]
+        result = field.solve(lut="none")
+        assert_allclose(result.exposures[0].x_err, NOISE, rtol=0.12)
+        assert field.rms(result) < 0.015
+
+    def test_floor(self, rng):
+        """Errors that are too optimistic for bright stars."""
+        field = Field(rng, n=3, distortion=cubic, stars=1500)
+        field.exposures = [
+            replace(e, x=e.x + rng.normal(0, 0.1, 1500), y=e.y + rng.normal(0, 0.1, 1500))
+            for e in field.exposures
+        ]
+        result = field.solve(lut="none")
+        assert_allclose(result.solution.statistics["error_floor"], 0.1, rtol=0.2)
+
+    def test_some_bad_errors_and_positions(self, rng):
+        field = Field(rng, n=2, distortion=cubic)
+        e = field.exposures[0]
+        e.x_err[:5], e.y_err[5:10], e.x[10:15] = np.nan, 0.0, np.nan
+        result = field.solve(lut="none")
+        fit = result.exposures[0]
+        assert not fit.used[:15].any()
+        assert np.isfinite(fit.dx[:10]).all()
+        assert np.isnan(fit.dx[10:15]).all()
+        assert field.rms(result) < 0.02
+
+    @pytest.mark.parametrize(
+        ("change", "match"),
+        [
+            (
+                {"x_err": np.full(400, np.nan)},
+                "none of 400 pairs can be used: .* 400 have errors that are NaN",
+            ),
+            ({"y_err": np.zeros(400)}, "400 have errors"),
+            ({"x": np.full(400, np.nan)}, "400 have NaN positions"),
+            ({"use": np.zeros(400, bool)}, "400 are held out"),
+            ({"x": np.full(400, 5000.0)}, "400 lie off the detector of 2048 x 2000 px"),
+        ],
+    )
+    def test_nothing_usable(self, rng, change, match):
+        field = Field(rng, n=1)
+        field.exposures = [replace(field.exposures[0], **change)]
+        with pytest.raises(FitError, match=match):
+            field.solve()
+
+    @pytest.mark.parametrize("lut", ["auto", "none"])
+    def test_few_stars_lower_the_degree(self, rng, lut):
+        field = Field(rng, n=1, stars=25, distortion=lambda x, y: (1e-6 * (x - 1000) ** 2, 0 * y))
+        result = field.solve(lut=lut)
+        assert result.solution.pv.degree < 3
+        assert result.solution.lookup_table is None
+
+    @pytest.mark.parametrize("stars", [0, 5, 9])
+    def test_too_few_stars(self, rng, stars):
+        with pytest.raises(FitError, match=f"{stars} pairs|0 pairs"):
+            Field(rng, n=1, stars=stars).solve()
+
+    def test_all_stars_in_a_corner(self, rng):
+        field = corner(rng, 400, 300.0)
+        with pytest.raises(
+            FitError, match=r"400 stars span 2\.\d% of the detector \(x \d+ to \d+ of 2048"
+        ):
+            field.solve()
+
+    def test_no_stars_within_r0(self, rng):
+        field = Field(rng, n=1, stars=400)
+        far = np.hypot(field.exposures[0].x - CRPIX[0], field.exposures[0].y - CRPIX[1]) > 800
+        field.exposures = [replace(field.exposures[0], use=far)]
+        with pytest.raises(
+            FitError, match=r"only 0 of \d+ stars have a weight above 0.5 .*r0 = 500 px"
+        ):
+            solve_instrument(
+                field.exposures, image_shape=SHAPE, crpix=CRPIX, weight=RadialWeight(r0=500.0)
+            )
+
+    def test_bad_options(self, rng):
+        field = Field(rng, n=1, stars=50)
+        with pytest.raises(ValueError, match="refine must be"):
+            field.solve(refine="all")
+        with pytest.raises(ValueError, match="lut must be"):
+            field.solve(lut="maybe")
+        with pytest.raises(FitError, match="no exposure"):
+            solve_instrument([], image_shape=SHAPE)
+        field.exposures = [replace(field.exposures[0], ra=np.zeros(3))]
+        with pytest.raises(ValueError, match="exposure e0: ra has 3 values, x has 50"):
+            field.solve()
+
+
+@pytest.mark.parametrize(
+    ("sensor", "table", "cubic_only"), [("NE", 10.5, 17.5), ("NW", 10.2, 17.5)]
+)
+def test_wircam_sensor(shared_data, sensor, table, cubic_only):
+    """Real pairs of one sensor without errors, without a WCS, 20 % held out; scatter in mas."""
+    rows = Table.read(shared_data / "wircam" / "matched_NE_NW.ecsv.gz", format="ascii.ecsv")
+    rows = rows[np.asarray(rows["qq"]) == sensor]
+    x, y = np.asarray(rows["xmeas"], float) - 1, np.asarray(rows["ymeas"], float) - 1
+    ra, dec = np.asarray(rows["ra"], float), np.asarray(rows["dec"], float)
+    centre = np.array([np.median(ra), np.median(dec)])
+    # A straight line through the pairs, robustly, is all the starting WCS there is.
+    columns, kept = (
+        np.stack([np.ones_like(x), x - 1023.5, y - 1023.5], axis=1),
+        np.ones(len(x), bool),
+    )
+    plane = np.array(project(ra, dec, centre)).T
+    for _ in range(10):
+        linear = np.linalg.lstsq(columns[kept], plane[kept], rcond=None)[0]
+        residual = np.hypot(*(plane - columns @ linear).T)
+        kept = residual < 5 * np.median(residual)
+    use = np.random.default_rng(0).uniform(size=len(x)) > 0.2
+    exposure = Exposure(sensor, x, y, ra, dec, deproject(*linear[0], centre), linear[1:].T, use=use)
+
+    def scatter(lut):
+        fit = solve_instrument([exposure], image_shape=(2048, 2048), lut=lut).exposures[0]
+        scale = 3.6e6 * np.sqrt(abs(np.linalg.det(fit.cd)))
+        held = [d[~use] * scale for d in (fit.dx, fit.dy)]
+        return [1.4826 * np.median(np.abs(h - np.median(h))) for h in held]
+
+    assert max(scatter("none")) <= cubic_only
+    assert np.mean(scatter("auto")) <= table
