@@ -27,7 +27,7 @@ from gwcs import WCS
 from gwcs import coordinate_frames as cf
 
 from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, TangentSky
-from wpdc_gwcs.models.blocks import THREADED_BLOCK_SIZE, evaluate_blocks, run_blocks
+from wpdc_gwcs.models.blocks import evaluate_blocks, run_blocks
 from wpdc_gwcs.models.mapping import PlaneMap, fit_polynomial
 
 __all__ = ["DetectorWCS", "build_wcs", "sky_map", "to_stock_wcs"]
@@ -276,7 +276,7 @@ def sky_map(wcs, *, image_shape=None, out=None):
     columns = np.arange(nx, dtype=float)
     # Threads take bands of rows, in pieces that stay in the cache.
     band = max(1, _BAND_SIZE // nx)
-    step = max(1, THREADED_BLOCK_SIZE // nx)
+    step = max(1, _PIECE_SIZE // nx)
 
     def fill(first, last):
         if isinstance(transform, DetectorToSky):
@@ -293,8 +293,9 @@ def sky_map(wcs, *, image_shape=None, out=None):
     return ra, dec
 
 
-# Pixels in a band of rows.
+# Pixels in a band of rows that a thread takes, and in a piece of it that is worked on at a time.
 _BAND_SIZE = 524_288
+_PIECE_SIZE = 65_536
 
 
 def _any_rows(transform, x):

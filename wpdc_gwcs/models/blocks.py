@@ -12,14 +12,14 @@ from functools import cache
 
 import numpy as np
 
-__all__ = ["BLOCK_SIZE", "THREADED_BLOCK_SIZE", "evaluate_blocks", "run_blocks"]
+__all__ = ["BLOCK_SIZE", "evaluate_blocks", "run_blocks"]
 
 #: Points per block where one thread works: the work arrays stay in a core's second-level cache.
 BLOCK_SIZE = 16384
 
-#: Points per block where several do.  A thread that finds the interpreter lock taken sleeps and is
-#: woken, which costs some 50 us; steps this long make that rare.
-THREADED_BLOCK_SIZE = 65536
+# Points per block where several do.  A thread that finds the interpreter lock taken sleeps and is
+# woken, which costs some 50 us; steps this long make that rare.
+_THREADED_BLOCK_SIZE = 131072
 
 # Below this many points the threads cost more than they bring.
 _THREADED_SIZE = 65536
@@ -61,7 +61,7 @@ def run_blocks(function, size, *, weight=1):
         step = max(1, BLOCK_SIZE // weight)
     else:
         # As many blocks for one thread as for the other.
-        n_blocks = n_threads * math.ceil(size * weight / (THREADED_BLOCK_SIZE * n_threads))
+        n_blocks = n_threads * math.ceil(size * weight / (_THREADED_BLOCK_SIZE * n_threads))
         step = max(1, math.ceil(size / n_blocks))
     starts = range(0, size, step)
     if n_threads == 1:

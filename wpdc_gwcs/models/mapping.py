@@ -164,7 +164,7 @@ def _horner_columns(columns, s, total, slope=None):
 
 # Points whose four coefficients are worked on at a time, a compromise: fewer stay closer to the
 # core, more keep threads from waiting for each other.
-_PART_SIZE = 32768
+_PART_SIZE = 65536
 
 
 def _parts(n):
@@ -246,23 +246,32 @@ class CellGrid:
         x_low, x_high = self.x_low - margin, self.x_high + margin
         y_low, y_high = self.y_low - margin, self.y_high + margin
         outside = None
-        # Written so that NaN counts as outside.
-        if len(x) and not (
-            x.min() >= x_low and x.max() <= x_high and y.min() >= y_low and y.max() <= y_high
-        ):
-            good = (x >= x_low) & (x <= x_high)
-            good &= (y >= y_low) & (y <= y_high)
-            outside = ~good
-            x = np.where(good, x, self.x_low)
-            y = np.where(good, y, self.y_low)
+        at_edge = margin > 0
+        if len(x):
+            x_most, y_most = x.max(), y.max()
+            # Written so that NaN counts as outside.
+            if not (
+                x.min() >= x_low and x_most <= x_high and y.min() >= y_low and y_most <= y_high
+            ):
+                good = (x >= x_low) & (x <= x_high)
+                good &= (y >= y_low) & (y <= y_high)
+                outside = ~good
+                x = np.where(good, x, self.x_low)
+                y = np.where(good, y, self.y_low)
+                at_edge = True
+            # Within rounding of the division into cells.
+            near = 1.0 - 1e-12
+            at_edge |= x_most >= self.x_low + near * (self.x_high - self.x_low)
+            at_edge |= y_most >= self.y_low + near * (self.y_high - self.y_low)
         s = x - self.x_low
         s *= 1.0 / self.x_step
         t = y - self.y_low
         t *= 1.0 / self.y_step
         i, j = np.floor(s), np.floor(t)
-        # The last edge belongs to the last cell, a margin to the outermost ones.
-        np.minimum(i, self.nx - 1, out=i)
-        np.minimum(j, self.ny - 1, out=j)
+        if at_edge:
+            # The last edge belongs to the last cell, a margin to the outermost ones.
+            np.minimum(i, self.nx - 1, out=i)
+            np.minimum(j, self.ny - 1, out=j)
         if margin:
             np.maximum(i, 0, out=i)
             np.maximum(j, 0, out=j)
