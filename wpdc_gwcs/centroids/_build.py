@@ -23,7 +23,7 @@ _SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 
 # Expected size of the difference between the PSF and a Moffat profile, relative to the profile:
 # of its fourth differences (in units of a Gaussian's), and of itself.
-_ROUGHNESS = 0.15
+_ROUGHNESS = 0.4
 _DEVIATION = 0.3
 
 # Places along each axis at which a varying profile is tabulated.
@@ -174,7 +174,7 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations)
             break
         noise = estimate_noise(field, profile, noise, stars, radius=radius, gain=gain)
         # A profile is never known better, and the brightest stars must not rule alone.
-        noise = replace(noise, mismatch=float(np.clip(noise.mismatch, 0.005, 0.3)))
+        noise = replace(noise, mismatch=float(np.clip(noise.mismatch, 0.003, 0.3)))
         change = _residual_coefficients(field, noise, start, stars, fwhm)
         profile = _centered(replace(start, coefficients=start.coefficients + change), fwhm)
     fits = fit_stars(field, profile, noise, stars, radius=radius)

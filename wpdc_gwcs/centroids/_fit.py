@@ -24,7 +24,7 @@ __all__ = [
 _CHUNK = 4000
 
 # Error of the profile below which nobody's data can tell.
-_MIN_MISMATCH = 0.003
+_MIN_MISMATCH = 0.002
 
 _MAX_STEP = 0.5  # px per iteration
 _MAX_ITERATIONS = 12

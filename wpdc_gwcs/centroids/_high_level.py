@@ -126,7 +126,7 @@ def _learn(field, stars, fwhm, gain, vary):
     shape = fit_moffat(field, noise, stars.take(slice(200)), fwhm, half=half, radius=wide)
     start = Profile.constant(moffat_samples(shape, half, OVERSAMPLING), OVERSAMPLING)
     options = {"fwhm": fwhm, "radius": radius, "gain": gain}
-    profile, stars, noise = learn_profile(field, noise, stars, start, iterations=3, **options)
+    profile, stars, noise = learn_profile(field, noise, stars, start, iterations=4, **options)
     n = len(stars.x)
     if n < _MIN_STARS:
         return None

@@ -87,7 +87,9 @@ class Profile:
             Shares.
         """
         wx, wy = _hat(x, self.x_nodes), _hat(y, self.y_nodes)
-        return (wy[:, :, None] * wx[:, None, :]).reshape(len(x), -1) @ self._components[1]
+        return (wy[:, :, None] * wx[:, None, :]).reshape(
+            len(x), len(self.coefficients)
+        ) @ self._components[1]
 
     def evaluate(self, dx, dy, half, shares, *, gradient=True):
         """Profile of each star in the pixels of its cut-out.
@@ -115,10 +117,10 @@ class Profile:
             outer.append(-self.oversampling * taps_y[:, :, None] * slopes_x[:, None, :])
             outer.append(-self.oversampling * slopes_y[:, :, None] * taps_x[:, None, :])
         outer = np.stack(outer).reshape(len(outer), len(dx), 1, 16) * shares[:, :, None]
-        outer = outer.reshape(len(outer), len(dx), -1)
+        outer = outer.reshape(len(outer), len(dx), 16 * shares.shape[1])
         result = np.empty((len(outer), len(dx), (2 * half + 1) ** 2))
         grids = self._components[0]
-        margin = self.oversampling * (half + 3) + 4
+        margin = self.oversampling * (2 * half + 2) + 8
         padded = np.pad(grids, ((0, 0), (margin, margin), (margin, margin)))
         # Stars that ran far away see nothing but the padding.
         limit = margin - self.oversampling * half - 4
