@@ -30,6 +30,8 @@ app = typer.Typer(
 # The common base of what the command-line parser complains about; typer exports only a subclass.
 UsageError = typer.BadParameter.__bases__[0]
 
+_INTERRUPTED = 130
+
 
 def _show_version(value: bool):
     if value:
@@ -80,9 +82,9 @@ def set_verbosity(verbose, quiet):
     logger.setLevel(level)
 
     def show(message, category, filename, lineno, file=None, line=None):
-        # Our own warnings are about the user's data; those of libraries are about code: -v.
+        # Our own warnings are about the user's data; those of libraries are about code: -vv.
         ours = issubclass(category, WPDCWarning)
-        logger.log(logging.WARNING if ours else logging.INFO, "%s", message)
+        logger.log(logging.WARNING if ours else logging.DEBUG, "%s", message)
 
     warnings.simplefilter("default")
     warnings.showwarning = show
@@ -110,6 +112,8 @@ def run(args=None):
     try:
         status = app(args=args, prog_name="wpdc", standalone_mode=False)
         sys.stdout.flush()
+        if status == _INTERRUPTED:  # what typer makes of Ctrl-C
+            raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
     except UsageError as err:
         return _usage(err)
@@ -118,7 +122,7 @@ def run(args=None):
     except (FrameFailure, WPDCError) as err:
         return _fail(err, 1)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted; files already written are complete", 130)
+        return _fail("interrupted; files already written are complete", _INTERRUPTED)
     except BrokenPipeError:
         # The reader of our output has gone, which is no error; the exit must not flush again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

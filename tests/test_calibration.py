@@ -1,0 +1,235 @@
+"""The whole chain against simulated exposures whose distortion is known."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from astropy.wcs import WCS
+
+from wpdc_gwcs.calibration import Settings, calibrate, match_frame, measure_sources
+from wpdc_gwcs.calibration.checks import check_solution
+from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs
+from wpdc_gwcs.catalogs import read_catalog
+from wpdc_gwcs.exceptions import DetectionError, FitError, MatchError
+from wpdc_gwcs.simulation import simulate
+
+SHAPE = (1024, 1024)
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return simulate(3, image_shape=SHAPE, density=25, distortion=15, seed=5)
+
+
+@pytest.fixture(scope="module")
+def catalog(simulation):
+    return read_catalog(simulation.reference)
+
+
+@pytest.fixture(scope="module")
+def run(simulation, catalog):
+    frames = [e.frame() for e in simulation.exposures]
+    return calibrate(frames, catalog, settings=Settings(holdout=0.2))
+
+
+def rms_error(exposure, wcs):
+    dx, dy = exposure.wcs_error(wcs)[2:]
+    return np.sqrt(np.mean(dx**2 + dy**2))
+
+
+def test_every_frame_is_right_against_the_truth(simulation, run):
+    assert not run.failures
+    assert [c.frame for c in run.calibrations] == [e.name for e in simulation.exposures]
+    for exposure, calibration in zip(simulation.exposures, run.calibrations, strict=True):
+        # 450 stars of 0.05 px: six numbers alone leave 0.05 * sqrt(6 / 450) = 0.006 px
+        assert rms_error(exposure, calibration.wcs) < 0.02
+        assert rms_error(exposure, exposure.wcs) > 1
+
+
+def test_pairs_are_right(simulation, run):
+    for exposure, calibration in zip(simulation.exposures, run.calibrations, strict=True):
+        matches = calibration.matches
+        true = np.asarray(exposure.sources["reference_index"])[matches["source_index"]]
+        assert np.mean(true == np.asarray(matches["catalog_index"])) > 0.998
+        assert len(matches) > 0.95 * np.sum(exposure.sources["reference_index"] >= 0)
+
+
+def test_matches_hold_the_residuals_of_the_delivered_wcs(run):
+    for calibration in run.calibrations:
+        matches = calibration.matches
+        x, y = calibration.wcs.invert(np.asarray(matches["ra"]), np.asarray(matches["dec"]))
+        # the residuals are in undistorted pixels, these in detector pixels: alike within the
+        # local stretch and turn (3 %) of the distortion
+        np.testing.assert_allclose(np.asarray(matches["x"]) - x, matches["dx"], rtol=0.1, atol=5e-3)
+        np.testing.assert_allclose(np.asarray(matches["y"]) - y, matches["dy"], rtol=0.1, atol=5e-3)
+
+
+def test_held_out_stars_are_in_no_fit_and_as_good_as_the_others(run):
+    held = [np.asarray(c.matches["holdout"]) for c in run.calibrations]
+    assert 0.15 < np.concatenate(held).mean() < 0.25
+    for calibration, mask in zip(run.calibrations, held, strict=True):
+        assert not np.any(np.asarray(calibration.matches["used"])[mask])
+        statistics = calibration.statistics
+        assert statistics["holdout"]["n"] == mask.sum()
+        ratio = statistics["holdout"]["sigma_dx"] / statistics["residuals"]["sigma_dx"]
+        assert 0.7 < ratio < 1.4
+    rows = [set(np.asarray(c.matches["catalog_index"])[m]) for c, m in zip(run.calibrations, held)]
+    used = [set(np.asarray(c.matches["catalog_index"])[~m]) for c, m in zip(run.calibrations, held)]
+    assert not set.union(*rows) & set.union(*used)
+
+
+def test_summary_has_a_row_per_frame(run):
+    assert run.summary.colnames == [
+        "frame", "detector", "status", "reason", "n_sources", "n_matched",
+        "mean_dx", "sigma_dx", "mean_dy", "sigma_dy", "holdout_sigma_dx", "holdout_sigma_dy",
+        "rms_mas", "seconds",
+    ]  # fmt: skip
+    assert list(run.summary["status"]) == ["solved"] * 3
+    assert np.all(run.summary["sigma_dx"].to_value("pix") < 0.08)
+    assert np.all(np.isfinite(run.summary["holdout_sigma_dy"]))
+
+
+def test_a_stored_solution_leaves_six_numbers(simulation, catalog, run):
+    stored = run.solutions["sim"]
+    frame = simulation.exposures[2].frame()
+    sources = frame.load_sources()[:120]
+    few = replace(frame, load_sources=sources.copy)
+    found = calibrate(few, catalog, solution=stored)
+    assert not found.failures
+    calibration = found.calibrations[0]
+    assert np.array_equal(calibration.solution.pv.parameters, stored.pv.parameters)
+    assert rms_error(simulation.exposures[2], calibration.wcs) < 0.03
+
+
+def test_stored_solution_of_another_shape_is_refused(simulation, catalog, run):
+    frame = replace(simulation.exposures[0].frame(), image_shape=(1024, 1000))
+    found = calibrate(frame, catalog, solution=run.solutions["sim"])
+    assert not found.calibrations
+    assert "stored solution is for (1024, 1024)" in str(found.failures[frame.name])
+
+
+def test_a_frame_that_fails_leaves_the_others_alone(simulation, catalog):
+    good = simulation.exposures[0].frame()
+    rng = np.random.default_rng(8)
+    noise = Table({"x": rng.uniform(0, 1023, 60), "y": rng.uniform(0, 1023, 60)})
+    bad = replace(good, name="noise", load_sources=noise.copy)
+    empty = replace(good, name="empty", load_sources=noise[:0].copy)
+    found = calibrate([bad, good, empty], catalog)
+    assert [c.frame for c in found.calibrations] == [good.name]
+    assert isinstance(found.failures["noise"], MatchError)
+    assert isinstance(found.failures["empty"], DetectionError)
+    assert list(found.summary["status"]) == ["failed", "solved", "failed"]
+    assert list(found.summary["n_sources"]) == [60, len(good.load_sources()), 0]
+    assert "no rows" in found.summary["reason"][2]
+
+
+def test_catalogue_of_another_part_of_the_sky(simulation, catalog):
+    elsewhere = catalog.copy()
+    elsewhere["ra"] = np.asarray(elsewhere["ra"]) + 10
+    with pytest.raises(MatchError, match=r"no star within 0\.\d+ deg of the frame's centre"):
+        match_frame(simulation.exposures[0].frame(), elsewhere)
+
+
+def test_names_must_be_unique(simulation, catalog):
+    frame = simulation.exposures[0].frame()
+    with pytest.raises(ValueError, match="unique, got twice: sim-01"):
+        calibrate([frame, frame], catalog)
+    with pytest.raises(ValueError, match="at least one frame"):
+        calibrate([], catalog)
+    with pytest.raises(ValueError, match="jobs must be at least 1, got 0"):
+        calibrate(frame, catalog, jobs=0)
+
+
+def test_given_centroids_need_a_source_list(simulation):
+    frame = simulation.exposures[0].frame(image=True)
+    with pytest.raises(DetectionError, match="needs a source list"):
+        measure_sources(frame, Settings(centroids="given"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"weight": "w5"}, "weight must be one of exp-sqrt, .*got 'w5'"),
+        ({"r0": -5.0}, "r0 must be a positive number of px, got -5"),
+        ({"lut": "maybe"}, "lut must be one of auto, none, got 'maybe'"),
+        ({"refine": "all"}, "refine must be one of auto, attitude, pv, got 'all'"),
+        ({"n_grid": 2}, "n_grid must be between 4 and 1000, got 2"),
+        ({"holdout": 1.0}, "holdout must be between 0 and 0.9, got 1.0"),
+        ({"threshold": 0.0}, "threshold must be positive, got 0"),
+        ({"centroids": "moment"}, "centroids must be one of psf, windowed, given"),
+        ({"reference_point": "corner"}, "reference_point must be one of header, center"),
+    ],
+)
+def test_settings_are_checked(options, message):
+    with pytest.raises(ValueError, match=message):
+        Settings(**options)
+
+
+def test_linear_start_is_the_header_itself_for_tan():
+    header = WCS(naxis=2)
+    header.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    header.wcs.crpix, header.wcs.crval = [400.0, 600.0], [359.999, 80.0]
+    header.wcs.cd = [[-5e-5, 2e-5], [2e-5, 5e-5]]
+    start = linear_wcs(header, np.array([399.0, 599.0]))
+    np.testing.assert_allclose(start.crval, header.wcs.crval, atol=1e-11)
+    np.testing.assert_allclose(start.cd, header.wcs.cd, rtol=1e-6, atol=1e-13)
+    x, y = np.meshgrid([0.0, 500.0, 1000.0], [0.0, 500.0, 1000.0])
+    sky = header.wcs_pix2world(x.ravel(), y.ravel(), 0)
+    np.testing.assert_allclose(start.pixels(*sky), [x.ravel(), y.ravel()], atol=1e-3)
+
+
+def test_header_point_off_the_detector_gives_way_to_the_centre():
+    header = WCS(naxis=2)
+    header.wcs.crpix = [-300.0, 20.0]
+    frame = SimpleNamespace(wcs=header, image_shape=(100, 200))
+    np.testing.assert_array_equal(header_reference_point(frame), [99.5, 49.5])
+    header.wcs.crpix = [30.0, 20.0]
+    np.testing.assert_array_equal(header_reference_point(frame), [29.0, 19.0])
+
+
+def test_reference_point_at_the_nearest_source(simulation, catalog):
+    frame = simulation.exposures[0].frame()
+    found = calibrate(frame, catalog, settings=Settings(reference_point="nearest-source"))
+    crpix = found.solutions["sim"].crpix
+    matches = found.calibrations[0].matches
+    distance = np.hypot(matches["x"] - 511.5, matches["y"] - 511.5)
+    nearest = np.argmin(distance)
+    np.testing.assert_allclose(crpix, [matches["x"][nearest], matches["y"][nearest]])
+    assert rms_error(simulation.exposures[0], found.calibrations[0].wcs) < 0.03
+
+
+def fake_matches(rng, n=400):
+    x, y = rng.uniform(0, 1023, (2, n))
+    dx, dy = rng.normal(0, 0.05, (2, n))
+    return Table({"x": x, "y": y, "dx": dx, "dy": dy, "used": np.ones(n, bool)})
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda m: m["used"].__setitem__(slice(5, None), False), "5 stars agree"),
+        (lambda m: m["dx"].__imul__(50), "residuals scatter by 2.* px"),
+        (
+            lambda m: m["dx"].__setitem__((m["x"] < 256) & (m["y"] < 256), 0.12),
+            "parts of the frame are off by up to 0.1",
+        ),
+    ],
+)
+def test_a_solution_that_fails_its_checks_is_refused(rng, run, spoil, message):
+    frame = SimpleNamespace(source="fake.fits", image_shape=SHAPE)
+    matches = fake_matches(rng)
+    check_solution(frame, matches, run.solutions["sim"])
+    spoil(matches)
+    with pytest.raises(FitError, match=message):
+        check_solution(frame, matches, run.solutions["sim"])
+
+
+def test_a_folding_map_is_refused(rng, run):
+    solution = run.solutions["sim"]
+    pv = solution.pv.copy()
+    pv.pv1_7 = -200.0
+    frame = SimpleNamespace(source="fake.fits", image_shape=SHAPE)
+    with pytest.raises(FitError, match="stretches the detector by"):
+        check_solution(frame, fake_matches(rng), replace(solution, pv=pv))

@@ -1,0 +1,322 @@
+"""The command line: what it writes, what it refuses, and how it says so."""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import asdf
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+from wpdc_gwcs import read
+from wpdc_gwcs.cli.app import run
+from wpdc_gwcs.simulation import simulate, write_simulation
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return simulate(2, image_shape=(1024, 1024), density=25, distortion=15, seed=3)
+
+
+@pytest.fixture(scope="module")
+def inputs(simulation, tmp_path_factory):
+    """Files of a simulation: two FITS_LDAC lists and the reference."""
+    folder = tmp_path_factory.mktemp("input")
+    files = write_simulation(simulation, folder, images=(), sources="ldac")
+    return [str(f) for f in files["frames"]], str(files["reference"])
+
+
+@pytest.fixture(scope="module")
+def results(inputs, tmp_path_factory):
+    """Folder with the results of one calibration."""
+    frames, reference = inputs
+    folder = tmp_path_factory.mktemp("results")
+    status = run(["calibrate", *frames, "--catalog", reference, "--output", str(folder), "-q"])
+    assert status == 0
+    return folder
+
+
+def error_of(capsys):
+    """The single line of an error; no traceback, nothing else."""
+    captured = capsys.readouterr().err.strip().splitlines()
+    assert len(captured) == 1, captured
+    assert captured[0].startswith("wpdc: error: ")
+    return captured[0].removeprefix("wpdc: error: ")
+
+
+def test_calibrate_writes_what_it_promises(results, simulation):
+    names = sorted(p.name for p in results.iterdir())
+    assert names == [
+        "sim-01.matches.ecsv", "sim-01.wcs.asdf", "sim-02.matches.ecsv", "sim-02.wcs.asdf",
+        "sim.solution.asdf", "summary.ecsv",
+    ]  # fmt: skip
+    summary = Table.read(results / "summary.ecsv")
+    assert list(summary["status"]) == ["solved", "solved"]
+    for exposure in simulation.exposures:
+        with asdf.open(results / f"{exposure.name}.wcs.asdf", lazy_load=False) as file:
+            stock = file["wcs"]
+        for wcs in (stock, read(results / f"{exposure.name}.wcs.asdf").wcs):
+            dx, dy = exposure.wcs_error(wcs)[2:]
+            assert np.sqrt(np.mean(dx**2 + dy**2)) < 0.03
+        matches = Table.read(results / f"{exposure.name}.matches.ecsv")
+        assert {"source_index", "catalog_index", "x", "dx", "used", "holdout"} <= set(
+            matches.colnames
+        )
+
+
+def test_existing_files_are_kept(inputs, results, capsys):
+    frames, reference = inputs
+    before = {p.name: p.read_bytes() for p in results.iterdir()}
+    status = run(["calibrate", *frames, "--catalog", reference, "--output", str(results)])
+    assert status == 2
+    assert "sim-01.wcs.asdf: file exists, and is replaced only with --overwrite" in error_of(capsys)
+    assert {p.name: p.read_bytes() for p in results.iterdir()} == before
+
+
+def test_a_frame_that_fails_again_loses_its_old_wcs(inputs, results, tmp_path, capsys):
+    frames, reference = inputs
+    for path in results.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    elsewhere = Table.read(reference)
+    elsewhere["ra"] += 20.0
+    elsewhere.write(tmp_path / "elsewhere.fits")
+    status = run(
+        ["calibrate", frames[0], "--catalog", str(tmp_path / "elsewhere.fits"),
+         "--output", str(tmp_path), "--overwrite", "-q"]
+    )  # fmt: skip
+    assert status == 1
+    assert "sim-01: not solved: " in error_of(capsys)
+    assert not (tmp_path / "sim-01.wcs.asdf").exists()
+    assert (tmp_path / "sim-02.wcs.asdf").exists()
+    summary = Table.read(tmp_path / "summary.ecsv")
+    assert list(summary["status"]) == ["failed"]
+    assert "no star within" in summary["reason"][0]
+
+
+def test_three_stars_are_refused_and_the_others_solved(inputs, simulation, tmp_path, capsys):
+    frames, reference = inputs
+    header = tmp_path / "start.hdr"
+    simulation.exposures[0].header.totextfile(header)
+    Table({"x": [10.0, 500.0, 900.0], "y": [20.0, 400.0, 200.0]}).write(tmp_path / "three.ecsv")
+    status = run(
+        ["calibrate", str(tmp_path / "three.ecsv"), frames[0], "--wcs", str(header),
+         "--catalog", reference, "--output", str(tmp_path / "out"), "-q"]
+    )  # fmt: skip
+    assert status == 1
+    assert "three: not solved: too few sources" in error_of(capsys)
+    assert not (tmp_path / "out" / "three.wcs.asdf").exists()
+    assert (tmp_path / "out" / "sim-01.wcs.asdf").exists()
+
+
+def make_bad_files(folder, reference):
+    """Every kind of input that cannot be used."""
+    table = Table.read(reference)
+    table[:0].write(folder / "norows.fits")
+    bad = table.copy()
+    bad["ra"].unit = "mag"
+    bad.write(folder / "unit.fits")
+    bad = table.copy()
+    bad.remove_column("dec")
+    bad.write(folder / "nodec.fits")
+    (folder / "empty.fits").write_bytes(b"")
+    (folder / "text.fits").write_text("this is no FITS file\n")
+    fits.writeto(folder / "nowcs.fits", np.zeros((64, 64), "f4"))
+    (folder / "not-a-folder").write_text("")
+    (folder / "bad.toml").write_text("r0 = \n")
+    (folder / "unknown.toml").write_text("radius = 5\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{dir}/missing.fits"], r"missing.fits: must be a readable file"),
+        (["{dir}/empty.fits"], "empty.fits: must not be empty"),
+        (["{dir}/text.fits"], "text.fits: a FITS file must begin with"),
+        (["{dir}/nowcs.fits"], "nowcs.fits: header must have a celestial WCS"),
+        (["{frame}", "--catalog", "{dir}/missing.fits"], "missing.fits: catalogue must be"),
+        (["{frame}", "--catalog", "{dir}/norows.fits"], "norows.fits: catalogue must have rows"),
+        (["{frame}", "--catalog", "{dir}/nodec.fits"], "nodec.fits: .* 'ra' and 'dec'"),
+        (["{frame}", "--catalog", "{dir}/unit.fits"], "unit of column 'ra' must be an angle"),
+        (["{frame}", "--output", "{dir}/not-a-folder"], "not-a-folder: the output folder must be"),
+        (["{frame}", "--preset", "nope"], "unknown preset 'nope': must be one of bass-90prime"),
+        (["{frame}", "--weight", "w9"], "weight must be one of exp-sqrt, .* got 'w9'"),
+        (["{frame}", "--r0", "-5"], "r0 must be a positive number of px, got -5"),
+        (["{frame}", "--n-grid", "many"], "Invalid value for '--n-grid'"),
+        (["{frame}", "--holdout", "1.5"], "holdout must be between 0 and 0.9, got 1.5"),
+        (["{frame}", "--jobs", "0"], "--jobs must be at least 1, got 0"),
+        (["{frame}", "--update"], "--update needs the stored solution"),
+        (["{frame}", "--no-such-option"], "No such option"),
+        (["{frame}", "{frame}"], "would both write sim-01.wcs.asdf"),
+        (["{frame}", "--config", "{dir}/missing.toml"], "missing.toml: no such configuration"),
+        (["{frame}", "--config", "{dir}/bad.toml"], "bad.toml: not valid TOML"),
+        (["{frame}", "--config", "{dir}/unknown.toml"], "unknown option 'radius'"),
+        (["{frame}", "--solution", "{dir}/missing.asdf"], "missing.asdf"),
+        ([], "Missing argument"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_two(inputs, tmp_path, capsys, arguments, message):
+    frames, reference = inputs
+    make_bad_files(tmp_path, reference)
+    arguments = [a.format(dir=tmp_path, frame=frames[0]) for a in arguments]
+    for name, value in (("--catalog", reference), ("--output", str(tmp_path / "out"))):
+        if name not in arguments:
+            arguments += [name, value]
+    assert run(["calibrate", *arguments]) == 2
+    line = error_of(capsys)
+    assert re.search(message, line), line
+    assert not list(tmp_path.glob("**/*.wcs.asdf"))
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_options_come_from_preset_then_config_then_command_line(inputs, tmp_path, monkeypatch):
+    frames, reference = inputs
+    seen = []
+
+    def stop(frames, catalog, *, settings, **options):
+        seen.append(settings)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("wpdc_gwcs.calibration.calibrate", stop)
+    config = tmp_path / "my.toml"
+    config.write_text('r0 = 77.0\nn-grid = 31\nweight = "inverse"\n')
+    common = ["calibrate", frames[0], "--catalog", reference, "--output", str(tmp_path / "out")]
+    for order in (
+        ["--preset", "bass-90prime", "--config", str(config)],
+        ["--config", str(config), "--preset", "bass-90prime"],
+    ):
+        assert run([*common, *order, "--n-grid", "21"]) == 130
+        settings = seen.pop()
+        assert settings.reference_point == "nearest-source"  # the preset
+        assert settings.r0 == 77.0  # the file wins over the preset
+        assert settings.weight == "inverse"
+        assert settings.n_grid == 21  # what is typed wins over the file
+
+
+def test_interrupted_run_leaves_no_half_written_file(inputs, tmp_path):
+    frames, reference = inputs
+    command = [sys.executable, "-c", "from wpdc_gwcs.cli import main; main()", "calibrate"]
+    log = tmp_path / "log"
+    with log.open("w") as stderr:
+        process = subprocess.Popen(
+            [*command, *frames, "--catalog", reference, "--output", str(tmp_path / "out"), "-v"],
+            stderr=stderr,
+        )
+        while not log.stat().st_size:  # the first message says that the work has begun
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 130
+    errors = log.read_text()
+    assert "Traceback" not in errors
+    assert "wpdc: error: interrupted" in errors
+    assert not [p for p in (tmp_path / "out").iterdir() if p.suffix not in (".ecsv", ".asdf")]
+
+
+def test_transforms_agree_with_the_wcs_and_invert_each_other(results, capsys):
+    path = str(results / "sim-01.wcs.asdf")
+    wcs = read(path).wcs
+    assert run(["pix2sky", path, "100.25", "200.5"]) == 0
+    ra, dec = capsys.readouterr().out.split()
+    np.testing.assert_allclose([float(ra), float(dec)], wcs(100.25, 200.5), rtol=0, atol=1e-10)
+    assert run(["sky2pix", path, ra, dec]) == 0
+    np.testing.assert_allclose(
+        [float(v) for v in capsys.readouterr().out.split()], [100.25, 200.5], atol=2e-5
+    )
+    assert run(["sky2pix", path, ra, dec, "--origin", "1"]) == 0
+    np.testing.assert_allclose(
+        [float(v) for v in capsys.readouterr().out.split()], [101.25, 201.5], atol=2e-5
+    )
+
+
+def test_transform_of_a_table(results, tmp_path, capsys):
+    path = str(results / "sim-01.wcs.asdf")
+    table = Table({"name": ["a", "b"], "x": [10.0, 500.0], "y": [20.0, 600.0]})
+    table.write(tmp_path / "points.ecsv")
+    out = tmp_path / "sky.ecsv"
+    assert run(["pix2sky", path, str(tmp_path / "points.ecsv"), "--output", str(out)]) == 0
+    found = Table.read(out)
+    assert found.colnames == ["name", "x", "y", "ra", "dec"]
+    expected = read(path).wcs(table["x"].data, table["y"].data)
+    np.testing.assert_allclose([found["ra"], found["dec"]], expected, rtol=0, atol=1e-12)
+    assert run(["pix2sky", path, str(tmp_path / "points.ecsv"), "--output", str(out)]) == 2
+    assert "file exists" in error_of(capsys) or "exists" in error_of(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["pix2sky", "{file}", "-100", "5"], 1, "outside the detector"),
+        (["sky2pix", "{file}", "300.0", "-60.0"], 1, "outside the sky of the detector"),
+        (["pix2sky", "{file}", "1", "2", "3"], 2, "got 3 values"),
+        (["pix2sky", "{file}", "1", "two"], 2, "must be numbers, got 1 two"),
+        (["pix2sky", "{file}", "1", "2", "--origin", "2"], 2, "--origin must be 0 or 1, got 2"),
+        (["pix2sky", "missing.asdf", "1", "2"], 2, "missing.asdf"),
+        (["export", "{file}", "--format", "tnx", "--output", "o"], 2, "--format must be one of"),
+        (["export", "missing.asdf", "--format", "sip", "--output", "o"], 2, "missing.asdf"),
+        (["evaluate", "missing.matches.ecsv"], 2, "missing.matches.ecsv: no such file"),
+        (["detect", "missing.fits", "--output", "o.ecsv"], 2, "missing.fits"),
+    ],
+)
+def test_other_commands_refuse_in_one_line(results, capsys, arguments, status, message):
+    arguments = [a.format(file=results / "sim-01.wcs.asdf") for a in arguments]
+    assert run(arguments) == status
+    assert message in error_of(capsys)
+
+
+@pytest.mark.parametrize("form", ["fits", "cpdis", "head", "sip", "stock"])
+def test_export(results, tmp_path, capsys, form):
+    out = tmp_path / f"out.{'asdf' if form == 'stock' else 'fits'}"
+    command = ["export", str(results / "sim-01.wcs.asdf"), "--format", form, "--output", str(out)]
+    assert run(command) == 0
+    assert out.exists()
+    assert f"written as {form}" in capsys.readouterr().out
+    assert run(command) == 2
+    assert "replaced only with --overwrite" in error_of(capsys)
+    assert run([*command, "--overwrite", "-q"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_evaluate_prints_and_writes(results, tmp_path, capsys):
+    assert run(["evaluate", str(results)]) == 0
+    out = capsys.readouterr().out
+    assert "sim-01" in out
+    assert "sigma_dx" in out
+    table = tmp_path / "table.ecsv"
+    assert run(["evaluate", str(results / "sim-02.wcs.asdf"), "--output", str(table)]) == 0
+    found = Table.read(table)
+    assert list(found["frame"]) == ["sim-02"]
+    assert 0.01 < found["sigma_dx"][0] < 0.1
+
+
+def test_match_alone(inputs, tmp_path, capsys):
+    frames, reference = inputs
+    out = tmp_path / "pairs.ecsv"
+    assert run(["match", frames[0], "--catalog", reference, "--output", str(out)]) == 0
+    assert "pairs" in capsys.readouterr().out
+    assert len(Table.read(out)) > 400
+
+
+def test_help_and_version(capsys):
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("wpdc_gwcs ")
+    for command in ("calibrate", "detect", "match", "evaluate", "export", "pix2sky", "sky2pix",
+                    "simulate", "demo"):  # fmt: skip
+        assert run([command, "--help"]) == 0
+        assert f"wpdc {command}" in capsys.readouterr().out
+
+
+def test_parallel_frames_give_the_same_answer(inputs, results, tmp_path):
+    frames, reference = inputs
+    command = [sys.executable, "-c", "from wpdc_gwcs.cli import main; main()", "calibrate"]
+    subprocess.run(
+        [*command, *frames, "--catalog", reference, "--output", str(tmp_path), "--jobs", "2"],
+        check=True,
+        timeout=240,
+    )
+    for name in ("sim-01", "sim-02"):
+        one, two = (read(folder / f"{name}.wcs.asdf") for folder in (results, tmp_path))
+        np.testing.assert_allclose(one.wcs(7.0, 9.0), two.wcs(7.0, 9.0), rtol=0, atol=1e-10)
