@@ -110,7 +110,8 @@ class DistortionSolution:
         interpolate = RegularGridInterpolator(
             (table.y_grid, table.x_grid), nodes, bounds_error=False, fill_value=np.nan
         )
-        sigma_x, sigma_y, rho = np.moveaxis(interpolate(np.stack([y, x], axis=-1)), -1, 0)
+        points = np.stack([y.ravel(), x.ravel()], axis=-1)
+        sigma_x, sigma_y, rho = interpolate(points).T.reshape(3, *x.shape)
         cross = rho * sigma_x * sigma_y
         return np.array([[sigma_x**2, cross], [cross, sigma_y**2]])
 
@@ -224,7 +225,8 @@ class Calibration:
             total = s.covariance(x, y) + self._attitude_covariance(x, y)
         ny, nx = s.image_shape
         inside = (x >= -0.5) & (x <= nx - 0.5) & (y >= -0.5) & (y <= ny - 0.5)
-        sigma_x, sigma_y = (np.where(inside, np.sqrt(total[i, i]), np.nan) for i in range(2))
+        total = np.where(inside, total, np.nan)
+        sigma_x, sigma_y = np.sqrt(total[0, 0]), np.sqrt(total[1, 1])
         with np.errstate(invalid="ignore", divide="ignore"):
             rho = total[0, 1] / (sigma_x * sigma_y)
         return sigma_x, sigma_y, np.where((sigma_x == 0) | (sigma_y == 0), 0.0, rho)
