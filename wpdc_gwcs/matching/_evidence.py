@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import gammaln, pdtr
 
 from wpdc_gwcs.matching._mapping import count_terms
@@ -13,25 +14,27 @@ __all__ = ["AreaEvidence", "Evidence", "collect_evidence", "poisson_significance
 # Sources looked at for the chance level, and shifts tried.
 _SAMPLE = 10_000
 _N_SHIFTS = 10
-# Pairs that an area must lead one to expect before it is judged, and pairs that make it worth
-# splitting.
+# Pairs that a circle should hold, and those it must lead one to expect before it is judged.
+_PER_AREA = 16.0
 _JUDGED = 8.0
-_SPLIT = 48.0
-_MAX_DEPTH = 4
+_MOST_AREAS = 16
+# Stars counted in circles: more would not sharpen the verdict.
+_COUNTED = 60_000
 
 
 @dataclass(frozen=True)
 class AreaEvidence:
-    """Evidence in one rectangle of the frame.
+    """Evidence in one part of the frame: a circle about a position; circles overlap.
 
     Parameters
     ----------
-    x_min, x_max, y_min, y_max : float
-        The rectangle, px.
+    x, y, radius : float
+        The circle, px.
     n_sources, n_reference, n_pairs : int
         Stars of either list in it, and pairs.
     expected : float
-        Pairs expected if the area were like the rest of the frame.
+        Pairs expected from the stars of both lists, if the area were like the better parts of the
+        frame.
     expected_by_chance : float
         Pairs that chance gives.
     judged : bool
@@ -40,10 +43,9 @@ class AreaEvidence:
         Whether the pairs exceed chance and are not far fewer than expected; true where not judged.
     """
 
-    x_min: float
-    x_max: float
-    y_min: float
-    y_max: float
+    x: float
+    y: float
+    radius: float
     n_sources: int
     n_reference: int
     n_pairs: int
@@ -84,9 +86,9 @@ class Evidence:
             worst = max(bad, key=lambda a: a.expected - a.n_pairs)
             return (
                 f"{len(bad)} of {sum(a.judged for a in self.areas)} parts of the frame lack pairs; "
-                f"worst is x {worst.x_min:.0f} to {worst.x_max:.0f}, "
-                f"y {worst.y_min:.0f} to {worst.y_max:.0f} px: {worst.n_pairs} pairs, "
-                f"{worst.expected:.0f} expected, {worst.expected_by_chance:.2g} by chance"
+                f"worst is {worst.radius:.0f} px about ({worst.x:.0f}, {worst.y:.0f}): "
+                f"{worst.n_pairs} pairs, {worst.expected:.0f} expected, "
+                f"{worst.expected_by_chance:.2g} by chance"
             )
         return ""
 
@@ -164,8 +166,7 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
             detector[i_src],
             detector[sample[hits]],
             hit_weight,
-            (n_pairs / n_sources, n_pairs / max(1, n_reference)),
-            (-0.5, nx - 0.5, -0.5, ny - 0.5),
+            image_shape,
         )
     return Evidence(
         n_pairs=n_pairs,
@@ -196,45 +197,52 @@ def _count_by_chance(mapped, radius, stars):
     return len(hits) / _N_SHIFTS, hits
 
 
-def _judge_areas(sources, reference, pairs, chance, weight, shares, box, depth=0):
-    """Evidence of a rectangle or, where there are many stars, of its quarters."""
-    x0, x1, y0, y1 = box
-    expected = min(shares[0] * len(sources), shares[1] * len(reference))
-    if expected >= _SPLIT and depth < _MAX_DEPTH:
-        xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
-        areas = []
-        for right in (False, True):
-            for upper in (False, True):
-                part = [
-                    p[((p[:, 0] > xm) == right) & ((p[:, 1] > ym) == upper)]
-                    for p in (sources, reference, pairs, chance)
-                ]
-                quarter = (
-                    xm if right else x0,
-                    x1 if right else xm,
-                    ym if upper else y0,
-                    y1 if upper else ym,
-                )
-                areas += _judge_areas(*part, weight, shares, quarter, depth + 1)
-        return areas
-    by_chance = len(chance) * weight
-    judged = expected >= _JUDGED
-    n = len(pairs)
-    # p < 1e-3 on either side: more than chance, and not absurdly fewer than half of what the
-    # frame's average promises
-    accepted = (not judged) or (
-        poisson_significance(n, max(by_chance, 0.5 * weight)) > 3.7
-        and pdtr(n, 0.4 * expected) > 1e-3
+def _judge_areas(sources, reference, pairs, chance, weight, image_shape):
+    """Evidence in circles about the nodes of a grid over the frame, wide enough to hold pairs."""
+    ny, nx = image_shape
+    step = max(1, len(sources) // _COUNTED)
+    lists = [p[::step] for p in (sources, reference, pairs)]
+    side = int(np.clip(np.sqrt(len(lists[2]) / _PER_AREA), 3, _MOST_AREAS))
+    grid = np.meshgrid(np.linspace(0, nx - 1, side), np.linspace(0, ny - 1, side))
+    nodes = np.column_stack([g.ravel() for g in grid])
+    trees = [cKDTree(p) for p in lists]
+    k = int(np.ceil(_PER_AREA * len(lists[0]) / max(1, len(lists[2]))))
+    radius = trees[0].query(nodes, k=[min(k, trees[0].n)])[0][:, 0]
+    radius = np.maximum(radius, 0.6 * max(nx, ny) / (side - 1))
+    n_sources, n_reference, n_pairs = (
+        tree.query_ball_point(nodes, radius, return_length=True) for tree in trees
     )
+    by_chance = np.zeros(len(nodes))
+    if len(chance):
+        by_chance = cKDTree(chance).query_ball_point(nodes, radius, return_length=True)
+        by_chance = by_chance * weight / step
+    # the better parts of the frame say what to expect: an average would be pulled down by the bad
+    shares = [
+        np.quantile(n_pairs[n > 0] / n[n > 0], 0.75) if n.any() else 0.0
+        for n in (n_sources, n_reference)
+    ]
+    expected = np.minimum(shares[0] * n_sources, shares[1] * n_reference)
+    judged = expected >= _JUDGED
+    # p < 1e-3 either way: more than chance, and not far fewer than expected beyond scatter
+    floor = max(0.5 * weight / step, 1e-3)
+    exceeds = [
+        poisson_significance(n, max(c, floor)) > 3.7
+        for n, c in zip(n_pairs, by_chance, strict=True)
+    ]
+    enough = (pdtr(n_pairs, 0.8 * expected) > 1e-3) | (n_pairs > 0.4 * expected)
+    accepted = ~judged | (np.array(exceeds) & enough)
     return [
         AreaEvidence(
-            *(float(v) for v in box),
-            n_sources=len(sources),
-            n_reference=len(reference),
-            n_pairs=n,
-            expected=float(expected),
-            expected_by_chance=float(by_chance),
-            judged=judged,
-            accepted=bool(accepted),
+            x=float(nodes[i, 0]),
+            y=float(nodes[i, 1]),
+            radius=float(radius[i]),
+            n_sources=int(n_sources[i]) * step,
+            n_reference=int(n_reference[i]) * step,
+            n_pairs=int(n_pairs[i]) * step,
+            expected=float(expected[i]) * step,
+            expected_by_chance=float(by_chance[i]) * step,
+            judged=bool(judged[i]),
+            accepted=bool(accepted[i]),
         )
+        for i in range(len(nodes))
     ]

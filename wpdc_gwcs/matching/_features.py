@@ -27,6 +27,8 @@ __all__ = [
 BOX_WIDTHS = (0.02, 0.04, 0.08)
 # An agreement this surprising (decimal logarithm) makes a hypothesis member of a group.
 _LEAST_WORTH = 1.0
+# Anchors that are looked at whatever they cost.
+_LEAST_ANCHORS = 8
 # Neighbours that must coincide for a hypothesis.
 _LEAST_COUNT = 3
 # Differences held in memory at a time.
@@ -139,6 +141,7 @@ def compare_patterns(
     n_reference,
     max_log_scale,
     max_rotation,
+    budget,
     per_anchor=4,
 ):
     """Compare the neighbour patterns of some sources with those of all reference stars in reach.
@@ -157,6 +160,8 @@ def compare_patterns(
         Neighbours to look at on either side.
     max_log_scale, max_rotation : float
         Largest difference of local scale (natural log) and rotation (rad).
+    budget : int
+        Most differences of neighbours to look at; the last anchors are left out to keep to it.
     per_anchor : int
         Candidates to keep for every source.
 
@@ -165,6 +170,10 @@ def compare_patterns(
     Hypotheses
         The best candidates, most surprising first.
     """
+    sizes = tree.query_ball_point(sources.data[anchors], reach, return_length=True)
+    affordable = np.cumsum(sizes) * n_source * n_reference <= budget
+    affordable[:_LEAST_ANCHORS] = True
+    anchors, reach = anchors[affordable], reach[affordable]
     source_log, source_angle, _ = neighbour_pattern(sources, anchors, n_source)
     candidates = tree.query_ball_point(sources.data[anchors], reach, return_sorted=False)
     sizes = np.array([len(c) for c in candidates])
@@ -177,11 +186,6 @@ def compare_patterns(
     per_pair = source_log.shape[1] * reference_log.shape[1]
     parts = []
     chunk = max(1, _CHUNK // max(1, per_pair))
-    source_log, source_angle = source_log.astype(np.float32), source_angle.astype(np.float32)
-    reference_log, reference_angle = (
-        reference_log.astype(np.float32),
-        reference_angle.astype(np.float32),
-    )
     for start in range(0, len(anchor_of), chunk):
         part = slice(start, start + chunk)
         parts.append(
@@ -221,13 +225,20 @@ def compare_patterns(
 
 def _coincidences(log_s, angle_s, log_r, angle_r, max_log_scale, max_rotation):
     """Best common shift in (log d, theta) of patterns (P, ks) against (P, kr)."""
-    n = len(log_s)
-    pair, ks, kr = np.nonzero(np.abs(log_r[:, None, :] - log_s[:, :, None]) <= max_log_scale)
-    d_angle = angle_r[pair, kr] - angle_s[pair, ks]
-    d_angle -= np.float32(2 * np.pi) * np.rint(d_angle / np.float32(2 * np.pi))
-    near = np.abs(d_angle) <= max_rotation
-    pair, ks, kr, d_angle = pair[near], ks[near], kr[near], d_angle[near]
-    d_log = log_r[pair, kr] - log_s[pair, ks]
+    n, n_source = log_s.shape
+    n_reference = log_r.shape[1]
+    # Angles in 1/65536 turns: short integers wrap round by themselves.
+    turn_s, turn_r = (
+        np.rint(a * (2**15 / np.pi)).astype(np.int32).astype(np.uint16) for a in (angle_s, angle_r)
+    )
+    most = np.uint16(min(2**15 - 1, max_rotation * (2**15 / np.pi)))
+    turn = turn_r[:, None, :] - turn_s[:, :, None] + most
+    found = np.flatnonzero(turn <= 2 * most)
+    d_angle = (turn.ravel()[found].astype(float) - most) * (np.pi / 2**15)
+    pair, ks = found // (n_source * n_reference), found // n_reference % n_source
+    d_log = log_r[pair, found % n_reference] - log_s[pair, ks]
+    near = np.abs(d_log) <= max_log_scale
+    pair, d_log, d_angle = pair[near], d_log[near], d_angle[near]
     in_range = np.bincount(pair, minlength=n)
     surprise = np.zeros(n)
     center, half, expected = np.zeros((2, n)), np.zeros(n), np.zeros(n)

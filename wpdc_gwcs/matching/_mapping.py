@@ -10,7 +10,7 @@ __all__ = ["SmoothMap", "SmoothFit", "count_terms", "fit_smooth_map", "scatter_o
 MAX_ORDER = 7
 # Pairs that a fit of n terms needs at least: fewer, and leave-one-out errors no longer mean
 # anything.
-PAIRS_PER_TERM = 1.6
+PAIRS_PER_TERM = 2.0
 # Below this scatter (px) differences are round-off: it keeps noise-free input from ending in a
 # zero radius.
 SMALLEST_SCATTER = 1e-5

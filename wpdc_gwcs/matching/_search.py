@@ -37,6 +37,10 @@ _REFERENCE_SURPLUS = 2.0
 _SOURCE_SURPLUS = 1.3
 # Stars to look up by their neighbourhood and neighbours to compare, try by try.
 _TRIES = ((16, 8), (49, 12), (196, 24))
+# Comparisons of neighbours in one try.
+_BUDGET = 100_000_000
+# Starts that may end well but for a part of the frame.
+_MOST_PARTIAL = 3
 # Groups of hypotheses that are followed up.
 _N_SEEDS = 8
 # Triples of pairs tried for a linear mapping, and the share of pairs that should follow it.
@@ -44,6 +48,8 @@ _N_TRIPLES = 1000
 _AGREEING_SHARE = 0.2
 # Sources that take part in fits of the mapping: more would not make it better.
 _FIT_SAMPLE = 20_000
+# Lists up to this length try lower orders when they are stuck.
+_EXPLORED = 3000
 # Pairing radius in units of the scatter: while the mapping grows, and in the end (chance to lose a
 # right pair: 3e-7).
 _GROW_RADIUS = 5.0
@@ -135,6 +141,7 @@ class Search:
         self.rules = {"min_significance": min_significance, "min_purity": min_purity}
         self.best_failure = None
         self.seen = set()
+        self.n_partial = 0
 
     # starts
 
@@ -167,7 +174,12 @@ class Search:
                 for turn in turns:
                     sources = Stars.build(self.turned(turn)[rows_s])
                     hypotheses, groups = self.seeds(
-                        sources, reference, self.flux_rank(rows_s), n_anchors, n_neighbours
+                        sources,
+                        reference,
+                        self.flux_rank(rows_s),
+                        n_anchors,
+                        n_neighbours,
+                        _BUDGET // len(turns),
                     )
                     seeds += [
                         (support, turn, sources, hypotheses.take(rows)) for support, rows in groups
@@ -183,6 +195,8 @@ class Search:
                             self.check_header(found[0])
                             parity = int(np.sign(np.linalg.det(turn)))
                             return _turn_mapping(found[0], turn), *found[1:], parity
+                        if self.n_partial >= _MOST_PARTIAL:
+                            raise self.refusal(hint=False)
         raise self.refusal(hint=not blind)
 
     def try_pairs(self, turn, sources, rows_s, reference, rows_r, pairs, clock):
@@ -231,7 +245,7 @@ class Search:
         """Order in which stars are preferred as anchors; None without fluxes."""
         return None if self.flux is None else -self.flux[rows]
 
-    def seeds(self, sources, reference, rank, n_anchors, n_neighbours):
+    def seeds(self, sources, reference, rank, n_anchors, n_neighbours, budget):
         """Hypotheses for a spread of anchors and the groups among them that agree."""
         ratio, _, _ = density_ratio_map(*sources.points.T, *reference.points.T, self.shape)
         many, few = np.quantile(ratio, [0.75, 0.25])
@@ -249,6 +263,7 @@ class Search:
             n_reference=n_reference,
             max_log_scale=limits.max_scale + limits.gradient,
             max_rotation=np.deg2rad(limits.max_rotation) + limits.gradient,
+            budget=budget,
         )
         area = np.pi * (limits.half_diagonal + limits.reach(limits.half_diagonal)) ** 2
         groups = select_coherent(
@@ -277,8 +292,10 @@ class Search:
         first = np.concatenate([[True], cell[order][1:] != cell[order][:-1]])
         starts = np.flatnonzero(first)
         place = np.arange(n) - np.repeat(starts, np.diff(np.append(starts, n)))
-        # empty cells leave room for second stars of full ones
-        return order[np.argsort(place, kind="stable")[:n_anchors]]
+        # empty cells leave room for second stars of full ones; central stars first, where the
+        # distortion is weakest as a rule
+        chosen = order[np.argsort(place, kind="stable")[:n_anchors]]
+        return chosen[np.argsort(np.hypot(*(sources[chosen] - self.frame.center).T))]
 
     # growth
 
@@ -302,24 +319,52 @@ class Search:
             return None
         return part[pairs[0]], pairs[1]
 
-    def grow(self, points, limit, reference, pairs, *, rounds=40):
+    def grow(self, points, limit, reference, pairs):
+        """Grow first pairs as far as they carry.
+
+        A high order may fit the stars that are there and predict nothing beyond them.  So when the
+        pairs stay, lower orders are tried too, and one that brings clearly more pairs carries on.
+        """
+        grown = self.grow_to_rest(points, limit, reference, pairs)
+        if grown is None or len(points) > _EXPLORED:
+            return grown
+        net = _count_net(grown, reference)
+        order = grown[0].mapping.order
+        while order > 1:
+            order -= 1
+            step = self.grow_once(points, limit, reference, grown[1], order)
+            if step is None or _count_net(step, reference) < net + max(2.0, 0.05 * net):
+                continue
+            further = self.grow_to_rest(points, limit, reference, step[1])
+            if further is not None and _count_net(further, reference) > net + 1.0:
+                grown, net = further, _count_net(further, reference)
+                order = grown[0].mapping.order
+        return grown
+
+    def grow_to_rest(self, points, limit, reference, pairs, *, rounds=40):
         """Fit, predict, pair again with the radius of the fit until the pairs stay."""
-        before = None
-        result = None
+        grown, before = None, None
         for _ in range(rounds):
-            i, j = pairs
-            fit = self.fit(points[i], reference.points[j])
-            if fit is None:
-                return result
-            mapped, leverage = _predict(points, fit, None)
-            radius = _GROW_RADIUS * fit.scatter * np.sqrt(1 + leverage)
-            pairs, radius = _pair(mapped, radius, limit, reference)
-            result = fit, pairs, mapped, radius
+            step = self.grow_once(points, limit, reference, pairs, self.max_order)
+            if step is None:
+                break
+            grown, pairs = step, step[1]
             key = _key(pairs)
             if key == before:
                 break
             before = key
-        return result
+        return grown
+
+    def grow_once(self, points, limit, reference, pairs, max_order):
+        """Fit and pair again: fit, pairs, mapped positions, radii; `None` without a fit."""
+        i, j = pairs
+        fit = self.fit(points[i], reference.points[j], max_order=max_order)
+        if fit is None:
+            return None
+        mapped, leverage = _predict(points, fit, None)
+        radius = _GROW_RADIUS * fit.scatter * np.sqrt(1 + leverage)
+        pairs, radius = _pair(mapped, radius, limit, reference)
+        return fit, pairs, mapped, radius
 
     def grow_locally(self, points, limit, fit, pairs, *, rounds=12):
         """Take off what neighbouring pairs have in common, and pair again until the pairs stay.
@@ -381,17 +426,19 @@ class Search:
         clock.lap("evidence")
         if evidence.missing(**self.rules):
             self.note_failure(evidence)
+            # right as a whole but for a part of the frame: other starts seldom help
+            self.n_partial += evidence.significance >= self.rules["min_significance"]
             return None
         return fit.mapping, evidence, pairs, n_ambiguous, scatter, float(np.median(radius))
 
-    def fit(self, points, reference, **options):
+    def fit(self, points, reference, *, max_order=None, **options):
         """Fit a smooth mapping in the frame's own units."""
         return fit_smooth_map(
             *points.T,
             *reference.T,
             center=self.frame.center,
             scale=self.frame.scale,
-            max_order=self.max_order,
+            max_order=max_order or self.max_order,
             **options,
         )
 
@@ -556,6 +603,13 @@ def _pair(mapped, radius, limit, reference):
     i, j, _ = find_edges(mapped, reference.tree, radius, limit=reference.limit)
     keep, _ = one_to_one(i, j, len(mapped), len(reference.points))
     return (i[keep], j[keep]), radius
+
+
+def _count_net(grown, reference):
+    """Pairs less those that chance gives at the radii used."""
+    _, (i, _), mapped, radius = grown
+    near = find_nearest(reference.tree, mapped, 1)[1]
+    return len(i) - _MAX_CROWDING * float(((radius / reference.limit[near]) ** 2).sum())
 
 
 def _key(pairs):
