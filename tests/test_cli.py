@@ -292,6 +292,21 @@ def test_evaluate_prints_and_writes(results, tmp_path, capsys):
     assert 0.01 < found["sigma_dx"][0] < 0.1
 
 
+def test_monitor_tells_a_changed_table(results, tmp_path, capsys):
+    solution = str(results / "sim.solution.asdf")
+    assert run(["monitor", solution, str(results)]) == 0
+    assert "sim: no drift found" in capsys.readouterr().out
+    matches = Table.read(results / "sim-01.matches.ecsv")
+    matches["dx"][(matches["x"] < 512) & (matches["y"] < 512)] += 0.1
+    matches.write(tmp_path / "sim-01.matches.ecsv")
+    cells = tmp_path / "cells.ecsv"
+    assert run(["monitor", solution, str(tmp_path), "--output", str(cells)]) == 1
+    assert "sim: has drifted" in capsys.readouterr().out
+    assert Table.read(cells)["changed"][0]
+    assert run(["monitor", str(results / "sim-01.wcs.asdf"), str(tmp_path)]) == 2
+    assert "needs a *.solution.asdf file" in error_of(capsys)
+
+
 def test_match_alone(inputs, tmp_path, capsys):
     frames, reference = inputs
     out = tmp_path / "pairs.ecsv"

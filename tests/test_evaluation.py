@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from astropy.table import Table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from wpdc_gwcs.evaluation import binned_residuals, d80, evaluate, robust_scatter
+from wpdc_gwcs.evaluation import binned_residuals, d80, detect_drift, evaluate, robust_scatter
+from wpdc_gwcs.models import LookupTable, PVPolynomial
+from wpdc_gwcs.solution import DistortionSolution
 
 
 def test_moments_of_a_normal_distribution_with_wrong_matches():
@@ -92,3 +95,92 @@ def test_empty_cells_are_nan_and_bins_are_checked():
     assert count.sum() == 0
     with pytest.raises(ValueError, match="n_bins must be at least 1, got 0"):
         binned_residuals([], [], [], [], image_shape=(10, 10), n_bins=0)
+
+
+SHAPE = (1000, 1200)
+
+
+def make_solution(sigma):
+    """Solution with a table of zeros and this uncertainty at its nodes."""
+    x_grid, y_grid = np.linspace(-0.5, 1199.5, 8), np.linspace(-0.5, 999.5, 7)
+    zero = np.zeros((7, 8))
+    return DistortionSolution(
+        "d",
+        SHAPE,
+        np.array([599.5, 499.5]),
+        np.diag([-2e-5, 2e-5]),
+        np.array([10.0, 20.0]),
+        PVPolynomial(),
+        lookup_table=LookupTable(x_grid, y_grid, zero, zero),
+        table_sigma=np.array([zero + sigma, zero + sigma, zero]),
+    )
+
+
+def make_matches(rng, n, *, scatter=0.05, stated=0.05):
+    x, y = rng.uniform(-0.5, 1199.5, n), rng.uniform(-0.5, 999.5, n)
+    dx, dy = rng.normal(0, scatter, (2, n))
+    dx[: n // 500] += rng.normal(0, 1, n // 500)  # wrong pairs
+    error = np.full(n, stated)
+    return Table({"x": x, "y": y, "dx": dx, "dy": dy, "x_err": error, "y_err": error})
+
+
+def test_false_alarms_are_as_rare_as_stated():
+    rng = np.random.default_rng(11)
+    solution = make_solution(0.001)
+    alarms = sum(
+        detect_drift(solution, [make_matches(rng, 600) for _ in range(3)], false_alarm=0.05).drifted
+        for _ in range(200)
+    )
+    # 200 trials of at most 5 %: more than 18 would be a chance of 1 in 500
+    assert alarms <= 18
+
+
+def test_errors_that_are_too_small_raise_no_alarm():
+    rng = np.random.default_rng(12)
+    solution = make_solution(0.001)
+    alarms = [
+        detect_drift(solution, make_matches(rng, 2000, stated=0.02)).drifted for _ in range(20)
+    ]
+    assert sum(alarms) <= 1
+
+
+def test_drift_is_found_where_it_is_and_by_how_much():
+    rng = np.random.default_rng(13)
+    tables = [make_matches(rng, 3000) for _ in range(5)]
+    for table in tables:
+        table["dx"][(table["x"] < 599.5) & (table["y"] < 499.5)] += 0.03
+    drift = detect_drift(make_solution(0.002), tables)
+    assert drift.drifted
+    assert drift.p_value < 1e-6
+    assert drift.n_stars == 15000
+    assert drift.amplitude == pytest.approx(0.03, rel=0.2)
+    changed = drift.cells[drift.cells["changed"]]
+    assert np.all(changed["x_max"].value <= 600)
+    assert np.all(changed["y_max"].value <= 500)
+    quarter = changed[(changed["x_max"] - changed["x_min"]).value > 500][0]
+    assert quarter["dx"].value == pytest.approx(0.03, abs=5 * quarter["sigma_dx"].value)
+
+
+def test_large_drift_is_not_taken_for_wrong_pairs():
+    rng = np.random.default_rng(14)
+    table = make_matches(rng, 4000)
+    table["dy"][table["x"] > 900] -= 2.0
+    drift = detect_drift(make_solution(0.002), table)
+    assert drift.drifted
+    assert drift.cells["dy"][0].value == pytest.approx(-2.0, abs=0.02)
+
+
+def test_uncertain_table_explains_a_small_offset():
+    rng = np.random.default_rng(15)
+    table = make_matches(rng, 4000)
+    table["dx"][(table["x"] < 599.5) & (table["y"] < 499.5)] += 0.03
+    assert detect_drift(make_solution(0.001), table).drifted
+    assert not detect_drift(make_solution(0.03), table).drifted
+
+
+def test_drift_needs_stars_and_a_probability():
+    rng = np.random.default_rng(16)
+    with pytest.raises(ValueError, match="5 stars are too few to test"):
+        detect_drift(make_solution(0.001), make_matches(rng, 5))
+    with pytest.raises(ValueError, match="false_alarm must be between 0 and 1, got 2"):
+        detect_drift(make_solution(0.001), make_matches(rng, 500), false_alarm=2)

@@ -1,11 +1,31 @@
-"""Residual statistics of calibrated frames: clipped moments, d80, maps, pulls."""
+"""Residuals of calibrated frames: clipped moments, d80, maps, and drift of a stored table."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from astropy.stats import SigmaClip
+from astropy.table import QTable, Table
+from scipy.ndimage import median
+from scipy.stats import chi2
 
-__all__ = ["ResidualStatistics", "binned_residuals", "d80", "evaluate", "robust_scatter"]
+__all__ = [
+    "Drift",
+    "ResidualStatistics",
+    "binned_residuals",
+    "d80",
+    "detect_drift",
+    "evaluate",
+    "robust_scatter",
+]
+
+# Cells along each side of the detector in which a drift is looked for, coarse to fine.
+_DRIFT_GRIDS = (2, 4, 8, 16)
+_DRIFT_STARS = 8
+
+# The uncertainty of a table is itself an estimate: taken this much larger, so that a false alarm is
+# no more frequent than stated.
+_TABLE_MARGIN = 1.5
 
 
 @dataclass(frozen=True)
@@ -197,3 +217,151 @@ def binned_residuals(x, y, dx, dy, *, image_shape, n_bins=20):
         return np.where(count, total / safe, np.nan).reshape(n_bins, n_bins)
 
     return mean(dx), mean(dy), count.reshape(n_bins, n_bins)
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Whether a stored solution still holds, where it does not, and by how much.
+
+    Parameters
+    ----------
+    drifted : bool
+        Whether the residuals contradict the solution.
+    p_value : float
+        Probability of residuals as unlikely as these if nothing has changed.
+    false_alarm : float
+        Limit on the p-value: how often an unchanged instrument is reported as changed.
+    amplitude : float
+        Root mean square of the mean residual in the cells that have changed, px; 0 without drift.
+    n_stars : int
+        Stars tested.
+    cells : `~astropy.table.QTable`
+        Cells in which the residuals were averaged, most significant first: ``x_min``, ``x_max``,
+        ``y_min``, ``y_max`` in px, ``n``, means ``dx``, ``dy`` and their ``sigma_dx``,
+        ``sigma_dy`` in px, ``p_value`` of each cell alone, and ``changed``.
+    """
+
+    drifted: bool
+    p_value: float
+    false_alarm: float
+    amplitude: float
+    n_stars: int
+    cells: QTable
+
+
+def detect_drift(solution, matches, *, false_alarm=0.01):
+    """Test whether a stored solution still describes the detector.
+
+    Parameters
+    ----------
+    solution : DistortionSolution
+        The stored solution.
+    matches : `~astropy.table.Table` or iterable of them
+        Match tables of frames that were calibrated with this solution, attitude only: columns
+        ``x``, ``y``, ``dx``, ``dy``, ``x_err``, ``y_err`` in px.
+    false_alarm : float, optional
+        Accepted probability of reporting a change where there is none.
+
+    Returns
+    -------
+    Drift
+        The verdict, its p-value and the cells behind it.
+
+    Raises
+    ------
+    ValueError
+        If ``false_alarm`` is not between 0 and 1, or no cell has enough stars for a test.
+
+    Notes
+    -----
+    The residuals are averaged in 2 x 2 to 16 x 16 cells and compared with their own errors, scaled
+    to the observed scatter, and with the uncertainty of the solution.  The most significant cell
+    decides, its probability multiplied by the number of cells (Bonferroni), which holds whatever
+    the correlation between cells.  A change that is linear over the detector is not seen: it is in
+    the attitudes of the frames.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs import DistortionSolution, PVPolynomial, detect_drift
+    >>> cd = np.diag([-2e-5, 2e-5])
+    >>> solution = DistortionSolution(
+    ...     "d", (1000, 1000), np.array([499.5, 499.5]), cd, np.array([10.0, 20.0]), PVPolynomial()
+    ... )
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 999, (2, 4000))
+    >>> dx, dy = rng.normal(0, 0.05, (2, 4000))
+    >>> matches = Table({"x": x, "y": y, "dx": dx, "dy": dy, "x_err": dx * 0 + 0.05,
+    ...                  "y_err": dx * 0 + 0.05})
+    >>> detect_drift(solution, matches).drifted
+    False
+    >>> matches["dx"][(x < 500) & (y < 500)] += 0.02
+    >>> detect_drift(solution, matches).drifted
+    True
+    """
+    if not 0 < false_alarm < 1:
+        raise ValueError(f"false_alarm must be between 0 and 1, got {false_alarm}")
+    if isinstance(matches, Table) or not isinstance(matches, Iterable):
+        matches = [matches]
+    stars = np.concatenate([_drift_columns(table) for table in matches], axis=1)
+    x, y, residual, sigma = stars[0], stars[1], stars[2:4], stars[4:6]
+    cells = [
+        _drift_cells(solution, x, y, residual, sigma, n_grid=n_grid) for n_grid in _DRIFT_GRIDS
+    ]
+    cells = QTable(np.concatenate(cells))
+    if len(cells) == 0:
+        raise ValueError(
+            f"no part of the detector has {_DRIFT_STARS} stars: {x.size} stars are too few to test"
+        )
+    cells.sort("p_value")
+    cells["changed"] = cells["p_value"] * len(cells) < false_alarm
+    p_value = min(1.0, float(cells["p_value"][0]) * len(cells))
+    changed = cells[cells["changed"]]
+    amplitude = np.sqrt(np.mean(changed["dx"] ** 2 + changed["dy"] ** 2)) if len(changed) else 0.0
+    for name in ("x_min", "x_max", "y_min", "y_max", "dx", "dy", "sigma_dx", "sigma_dy"):
+        cells[name].unit = "pix"
+    return Drift(bool(len(changed)), p_value, false_alarm, float(amplitude), x.size, cells)
+
+
+def _drift_columns(table):
+    """Take position, residual and error of the valid stars of a frame, errors as the scatter is."""
+    names = ("x", "y", "dx", "dy", "x_err", "y_err")
+    columns = np.array([np.asarray(table[name], dtype=float) for name in names])
+    columns = columns[:, np.isfinite(columns).all(axis=0) & (columns[4:] > 0).all(axis=0)]
+    for axis in range(2):
+        scale = robust_scatter(columns[2 + axis] / columns[4 + axis])
+        columns[4 + axis] *= max(1.0, scale) if np.isfinite(scale) else 1.0
+    return columns
+
+
+def _drift_cells(solution, x, y, residual, sigma, *, n_grid):
+    """Mean residuals in n_grid x n_grid cells, and how unlikely each is."""
+    ny, nx = solution.image_shape
+    ix = np.clip(((x + 0.5) * n_grid / nx).astype(int), 0, n_grid - 1)
+    iy = np.clip(((y + 0.5) * n_grid / ny).astype(int), 0, n_grid - 1)
+    cell, labels = iy * n_grid + ix, np.arange(n_grid**2)
+    # A wrong pair must not speak for its cell; a change that is large must.
+    center = np.array([median(r, cell, labels) for r in residual])
+    kept = (np.abs(residual - center[:, cell]) < 5 * sigma).all(axis=0)
+    cell, residual, sigma = cell[kept], residual[:, kept], sigma[:, kept]
+    n = np.bincount(cell, minlength=n_grid**2)
+    full = np.flatnonzero(n >= _DRIFT_STARS)
+    weight = [np.bincount(cell, 1 / s**2, minlength=n_grid**2)[full] for s in sigma]
+    mean = [
+        np.bincount(cell, r / s**2, minlength=n_grid**2)[full] / w
+        for r, s, w in zip(residual, sigma, weight, strict=True)
+    ]
+    x_size, y_size = nx / n_grid, ny / n_grid
+    x_min, y_min = (full % n_grid) * x_size - 0.5, (full // n_grid) * y_size - 0.5
+    known = solution.covariance(x_min + x_size / 2, y_min + y_size / 2)
+    known = [np.nan_to_num(known[i, i]) * _TABLE_MARGIN**2 for i in range(2)]
+    variance = [1 / w + k for w, k in zip(weight, known, strict=True)]
+    statistic = mean[0] ** 2 / variance[0] + mean[1] ** 2 / variance[1]
+    return np.rec.fromarrays(
+        [
+            x_min, x_min + x_size, y_min, y_min + y_size, n[full], *mean,
+            *np.sqrt(variance), chi2.sf(statistic, 2),
+        ],
+        names="x_min,x_max,y_min,y_max,n,dx,dy,sigma_dx,sigma_dy,p_value",
+    )  # fmt: skip

@@ -218,7 +218,7 @@ def _calibration(frame, pairs, fit, instrument, settings, holdout, seconds):
         raise FitError(f"{frame.source}: {fit.reason}")
     i_src, i_ref = pairs
     if fit.pv is not None:
-        instrument = replace(instrument, pv=fit.pv, pv_covariance=fit.pv_covariance)
+        instrument = replace(instrument, pv=fit.pv)
     src, ref = frame.sources[i_src], frame.reference[i_ref]
     catalog_index = np.asarray(ref["catalog_index"])
     held = np.zeros(len(src), bool) if holdout is None else holdout[catalog_index]
@@ -259,6 +259,7 @@ def _calibration(frame, pairs, fit, instrument, settings, holdout, seconds):
         crval=np.asarray(fit.crval),
         cd=np.asarray(fit.cd),
         attitude_covariance=fit.covariance,
+        pv_covariance=fit.pv_covariance,
         matches=matches,
         sources=frame.sources if frame.from_image else None,
         statistics=statistics,

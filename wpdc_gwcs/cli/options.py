@@ -10,7 +10,7 @@ import typer
 from wpdc_gwcs.cli.app import set_verbosity
 from wpdc_gwcs.exceptions import InputError
 
-__all__ = ["Config", "Overwrite", "Preset", "Quiet", "Verbose"]
+__all__ = ["Config", "Overwrite", "Preset", "Quiet", "Verbose", "require_free"]
 
 
 def preset_names():
@@ -115,3 +115,17 @@ Verbose = Annotated[
 Quiet = Annotated[
     bool, typer.Option("-q", "--quiet", help="Say nothing but errors.", callback=_quiet)
 ]
+
+
+def require_free(path, overwrite):
+    """Refuse to go on if this file is there and may not be replaced.
+
+    Parameters
+    ----------
+    path : Path
+        File that will be written.
+    overwrite : bool
+        Whether it may be replaced.
+    """
+    if path.exists() and not overwrite:
+        raise InputError(f"{path}: file exists, and is replaced only with --overwrite")

@@ -7,7 +7,7 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.calibrate import Catalog, WcsFile
-from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose
+from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free
 from wpdc_gwcs.exceptions import InputError
 
 Table = Annotated[Path, typer.Option("--output", metavar="FILE", help="Table to write (ECSV).")]
@@ -110,17 +110,3 @@ def match_command(
     write_table(table, output, overwrite=overwrite)
     if not quiet:
         typer.echo(f"{output}: {len(table)} pairs; {matched.diagnostics}")
-
-
-def require_free(path, overwrite):
-    """Refuse to go on if this file is there and may not be replaced.
-
-    Parameters
-    ----------
-    path : Path
-        File that will be written.
-    overwrite : bool
-        Whether it may be replaced.
-    """
-    if path.exists() and not overwrite:
-        raise InputError(f"{path}: file exists, and is replaced only with --overwrite")
