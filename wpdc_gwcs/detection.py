@@ -54,6 +54,11 @@ _HUGE = 1e15
 # of both together is no longer as good as that of a single star.
 _MAX_SHARE = 0.15
 
+# Rows searched at a time, and their overlap: every source is taken whole, from the strip that holds
+# its peak.
+_STRIP = 512
+_OVERLAP = 64
+
 # Sources measured at a time: bounds the memory for their cut-outs to some tens of MB.
 _CHUNK = 20_000
 
@@ -263,19 +268,29 @@ def detect_sources(
 
 def _extract(background, threshold, deblend_contrast):
     """Extract peaks with sep; returns its structured array."""
+    image, rms, mask = background.image, background.rms, background.mask
     # sep's defaults are for small images: it gives up where more pixels or branches are active.
-    sep.set_extract_pixstack(int(np.clip(background.image.size // 8, 1_000_000, 20_000_000)))
+    sep.set_extract_pixstack(int(np.clip(image.size // 8, 1_000_000, 20_000_000)))
     sep.set_sub_object_limit(8192)
-    return sep.extract(
-        background.image,
-        threshold * _KERNEL_NOISE,
-        err=background.rms,
-        mask=background.mask,
-        minarea=3,
-        filter_kernel=_KERNEL,
-        filter_type="conv",
-        deblend_cont=deblend_contrast,
-    )
+    parts = []
+    # In strips, because sep compares every source with every other one.
+    for first in range(0, image.shape[0], _STRIP):
+        last = min(first + _STRIP, image.shape[0])
+        start, stop = max(first - _OVERLAP, 0), min(last + _OVERLAP, image.shape[0])
+        part = sep.extract(
+            image[start:stop],
+            threshold * _KERNEL_NOISE,
+            err=rms[start:stop],
+            mask=None if mask is None else mask[start:stop],
+            minarea=3,
+            filter_kernel=_KERNEL,
+            filter_type="conv",
+            deblend_cont=deblend_contrast,
+        )
+        for name in ("y", "ypeak", "ycpeak"):
+            part[name] += start
+        parts.append(part[(part["ycpeak"] >= first) & (part["ycpeak"] < last)])
+    return np.concatenate(parts)
 
 
 def _cutouts(image, xc, yc, half):
