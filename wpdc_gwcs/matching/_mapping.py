@@ -69,8 +69,9 @@ class SmoothMap:
     -----
     With u = (x - x_c) / s and v = (y - y_c) / s
 
-    .. math:: X = x + \sum_{p+q \le n} a_{pq} T_p(u) T_q(v), \quad Y = y + \sum_{p+q \le n}
-    b_{pq} T_p(u) T_q(v)
+    .. math::
+        X = x + \sum_{p+q \le n} a_{pq} T_p(u) T_q(v), \quad
+        Y = y + \sum_{p+q \le n} b_{pq} T_p(u) T_q(v)
 
     Examples
     --------
