@@ -5,7 +5,6 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
-from astropy.nddata import NDData
 
 from wpdc_gwcs.centroids._build import (
     OVERSAMPLING,
@@ -40,6 +39,8 @@ _MIN_STARS = 8
 # Reduced chi square, absolute and relative to that of sources as bright, from which a source is
 # not a star.
 _MAX_CHI2 = 4.0
+# Reduced chi square up to which the formal errors stand; beyond, they grow with its root.
+_TOLERATED_CHI2 = 1.5
 # Light of neighbours, in standard deviations of the sky, that does not matter to a fit.
 _NEGLIGIBLE = 0.05
 _CHUNK = 10_000
@@ -91,10 +92,19 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
 
     Examples
     --------
-    >>> from wpdc_gwcs.detection import detect_sources, subtract_background  # doctest: +SKIP
-    >>> background = subtract_background(image)  # doctest: +SKIP
-    >>> sources = detect_sources(background)  # doctest: +SKIP
-    >>> epsf = build_epsf(background, sources)  # doctest: +SKIP
+    >>> import numpy as np
+    >>> from wpdc_gwcs import build_epsf, detect_sources
+    >>> from wpdc_gwcs.detection import subtract_background
+    >>> rng = np.random.default_rng(1)
+    >>> y, x = np.mgrid[:200, :200]
+    >>> image = rng.normal(100, 5, x.shape)
+    >>> for x0, y0 in 20 * np.mgrid[1:10, 1:10].reshape(2, -1).T + rng.uniform(-2, 2, (81, 2)):
+    ...     image += 3000 * np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / 3)
+    >>> background = subtract_background(image)
+    >>> sources = detect_sources(background)
+    >>> epsf = build_epsf(background, sources)
+    >>> epsf.oversampling
+    array([4, 4])
     """
     field = _field_of(data, error)
     if vary not in ("auto", "never"):
@@ -187,11 +197,25 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
     .. math::
         \sigma^2 = \sigma_\mathrm{sky}^2 + f \psi / g + (\epsilon f \psi)^2 .
 
-    The errors are those of the inverse of the normal matrix.
+    The errors are those of the inverse of the normal matrix, times
+    :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1.
 
     Examples
     --------
-    >>> fit_centroids(background, sources, epsf)  # doctest: +SKIP
+    >>> import numpy as np
+    >>> from wpdc_gwcs import build_epsf, fit_centroids, detect_sources
+    >>> from wpdc_gwcs.detection import subtract_background
+    >>> rng = np.random.default_rng(1)
+    >>> y, x = np.mgrid[:200, :200]
+    >>> image = rng.normal(100, 5, x.shape)
+    >>> for x0, y0 in 20 * np.mgrid[1:10, 1:10].reshape(2, -1).T + rng.uniform(-2, 2, (81, 2)):
+    ...     image += 3000 * np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / 3)
+    >>> background = subtract_background(image)
+    >>> sources = detect_sources(background)
+    >>> epsf = build_epsf(background, sources)
+    >>> fitted = fit_centroids(background, sources, epsf)
+    >>> bool(abs(fitted["x"][-1] - x0) < 0.02), bool(abs(fitted["y"][-1] - y0) < 0.02)
+    (True, True)
     """
     field = _field_of(data, error, saturation=sources.meta.get("saturation"))
     if passes < 1:
@@ -260,6 +284,8 @@ def _fitted_table(sources, fits, flags, fwhm):
     error = np.sqrt(np.where(good[:, None], np.einsum("sii->si", fits.covariance), np.nan))
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = fits.stars.flux / error[:, 2]
+        # Beyond chance, a high chi square is an unseen neighbour or a PSF that does not fit.
+        error *= np.sqrt(np.maximum(fits.chi2 / _TOLERATED_CHI2, 1))[:, None]
     columns = {
         "x": fits.stars.x,
         "y": fits.stars.y,
@@ -331,6 +357,7 @@ def _field_of(data, error, saturation=None):
 
 
 def _to_photutils(profile):
+    from astropy.nddata import NDData
     from photutils.psf import GriddedPSFModel, ImagePSF
 
     samples = profile.samples()
