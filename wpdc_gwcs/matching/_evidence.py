@@ -109,7 +109,7 @@ def poisson_significance(count, expected):
     return float(np.sqrt(max(0.0, -2 * log_p)))
 
 
-def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shape):
+def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shape, *, slack=1.0):
     """Measure what a set of pairs is worth.
 
     Parameters
@@ -126,6 +126,8 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
         The pairs.
     image_shape : (int, int)
         Shape of the frame.
+    slack : float
+        As it was used to find the pairs, see `find_edges`.
 
     Returns
     -------
@@ -146,7 +148,7 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
     usable = np.flatnonzero(radius > 0)
     step = max(1, -(-len(usable) // _SAMPLE))
     sample = usable[::step]
-    by_chance, hits = _count_by_chance(mapped[sample], radius[sample], stars)
+    by_chance, hits = _count_by_chance(mapped[sample], radius[sample], stars, slack)
     by_chance *= len(usable) / max(1, len(sample))
     hit_weight = len(usable) / max(1, len(sample)) / _N_SHIFTS
     back_x, back_y = mapping.inverse(*stars.points.T)
@@ -180,7 +182,7 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
     )
 
 
-def _count_by_chance(mapped, radius, stars):
+def _count_by_chance(mapped, radius, stars, slack):
     """Mean number of pairs at shifted positions, and the sources in them, all shifts."""
     if len(mapped) == 0:
         return 0.0, np.empty(0, int)
@@ -190,7 +192,7 @@ def _count_by_chance(mapped, radius, stars):
         # golden-angle spiral: directions and lengths without a common period
         length = base * (1 + 2 * (k + 0.5) / _N_SHIFTS)
         shift = length * np.array([np.cos(2.39996 * k), np.sin(2.39996 * k)])
-        i, j, _ = find_edges(mapped + shift, stars.tree, radius, limit=stars.limit)
+        i, j, _ = find_edges(mapped + shift, stars.tree, radius, limit=stars.limit, slack=slack)
         keep, _ = one_to_one(i, j, len(mapped), len(stars.points))
         hits.append(i[keep])
     hits = np.concatenate(hits)

@@ -14,7 +14,7 @@ def find_nearest(tree, points, k, **options):
     return tree.query(points, k=k, workers=2 if len(points) > _THREADED else 1, **options)
 
 
-def find_edges(points, tree, radius, *, limit=None):
+def find_edges(points, tree, radius, *, limit=None, slack=1.0):
     """List who has whom within reach.
 
     Parameters
@@ -29,6 +29,10 @@ def find_edges(points, tree, radius, *, limit=None):
         Largest radius that may be used to reach each partner (where partners stand close, a wide
         radius says
         nothing).
+
+    slack : float
+        A radius larger than the limit of a partner counts as the limit up to this factor; beyond,
+        the partner is out of reach.
 
     Returns
     -------
@@ -53,7 +57,7 @@ def find_edges(points, tree, radius, *, limit=None):
     if limit is not None:
         # the tree answers index n where there is nobody
         allowed = np.append(limit, 0.0)[partner]
-        inside &= reach[:, None] <= allowed
+        inside &= (reach[:, None] <= slack * allowed) & (distance <= allowed)
     row, column = np.nonzero(inside)
     return active[row], partner[row, column], distance[row, column]
 

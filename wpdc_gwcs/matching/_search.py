@@ -59,6 +59,8 @@ _SMALLEST_RADIUS = 0.05
 _START_RADIUS = 20.0
 # A radius must not reach further than where this many stars are expected by chance.
 _MAX_CROWDING = 0.25
+# While growing, a radius that would be larger by no more than this factor is cut to that limit.
+_SLACK = 2.5
 # Radius that may be used where stars are so sparse that 0.3 % are expected by chance within it.
 _WIDE_RADIUS = 20.0
 _HARMLESS = np.sqrt(0.003 / _MAX_CROWDING)
@@ -310,7 +312,7 @@ class Search:
             return None
         fit, pairs, mapped, radius = grown
         evidence = collect_evidence(
-            points, mapped, radius, reference, fit.mapping, pairs, self.shape
+            points, mapped, radius, reference, fit.mapping, pairs, self.shape, slack=_SLACK
         )
         clock.lap("evidence")
         # loose: this only spares hopeless starts the full round
@@ -343,16 +345,15 @@ class Search:
 
     def grow_to_rest(self, points, limit, reference, pairs, *, rounds=40):
         """Fit, predict, pair again with the radius of the fit until the pairs stay."""
-        grown, before = None, None
+        grown = None
         for _ in range(rounds):
             step = self.grow_once(points, limit, reference, pairs, self.max_order)
             if step is None:
                 break
+            at_rest = grown is not None and _are_alike(step[1], pairs)
             grown, pairs = step, step[1]
-            key = _key(pairs)
-            if key == before:
+            if at_rest:
                 break
-            before = key
         return grown
 
     def grow_once(self, points, limit, reference, pairs, max_order):
@@ -372,7 +373,7 @@ class Search:
         The pairs are nearly pure by now, so the polynomial is fitted without clipping: clipping
         would keep it from following where the distortion is steepest, in the corners.
         """
-        scatter, local, before = fit.scatter, None, None
+        scatter, local = fit.scatter, None
         reference = self.stars
         for _ in range(rounds):
             i, j = pairs
@@ -389,11 +390,9 @@ class Search:
             near = find_nearest(reference.tree, mapped, 1)[1]
             harmless = _HARMLESS * np.minimum(limit, reference.limit[near])
             radius = np.maximum(_GROW_RADIUS * error, np.minimum(_WIDE_RADIUS * error, harmless))
-            pairs, _ = _pair(mapped, radius, limit, reference)
-            key = _key(pairs)
-            if key == before:
+            before, (pairs, _) = pairs, _pair(mapped, radius, limit, reference)
+            if _are_alike(pairs, before):
                 break
-            before = key
         return fit, local, pairs, scatter
 
     def finish(self, points, pairs, clock):
@@ -599,8 +598,8 @@ def _sample(n, extra=()):
 def _pair(mapped, radius, limit, reference):
     """Unambiguous pairs while the mapping grows, and the radii that were used."""
     radius = np.maximum(radius, _SMALLEST_RADIUS)
-    radius[radius > limit] = 0.0
-    i, j, _ = find_edges(mapped, reference.tree, radius, limit=reference.limit)
+    radius = np.where(radius > _SLACK * limit, 0.0, np.minimum(radius, limit))
+    i, j, _ = find_edges(mapped, reference.tree, radius, limit=reference.limit, slack=_SLACK)
     keep, _ = one_to_one(i, j, len(mapped), len(reference.points))
     return (i[keep], j[keep]), radius
 
@@ -610,6 +609,12 @@ def _count_net(grown, reference):
     _, (i, _), mapped, radius = grown
     near = find_nearest(reference.tree, mapped, 1)[1]
     return len(i) - _MAX_CROWDING * float(((radius / reference.limit[near]) ** 2).sum())
+
+
+def _are_alike(pairs, others):
+    """Whether two sets of pairs differ by next to nothing: a few stars may come and go for ever."""
+    a, b = (i * (1 << 32) + j for i, j in (pairs, others))
+    return 2 * len(np.intersect1d(a, b, assume_unique=True)) >= 0.999 * (len(a) + len(b))
 
 
 def _key(pairs):
