@@ -500,3 +500,14 @@ def test_wircam_sensor(shared_data, sensor, table, cubic_only):
 
     assert max(scatter("none")) <= cubic_only
     assert np.mean(scatter("auto")) <= table
+
+
+def test_draft_and_given_choice(solved):
+    """Quick tables for matching again, then the settings found before."""
+    field, result = solved
+    draft = field.solve(draft=True)
+    assert draft.solution.table_sigma is None
+    assert field.rms(draft) < 0.015
+    again = field.solve(table_choice=result.table_info.choice)
+    assert again.table_info.candidates == ()
+    assert_allclose(field.rms(again), field.rms(result), rtol=0.05)

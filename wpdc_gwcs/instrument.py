@@ -32,7 +32,13 @@ from wpdc_gwcs.fitting import (
     robust_sigma,
     solve_linear,
 )
-from wpdc_gwcs.lookup import N_FOLDS, ResidualMap, build_lookup_table, choose_table
+from wpdc_gwcs.lookup import (
+    N_FOLDS,
+    ResidualMap,
+    TableInfo,
+    build_lookup_table,
+    choose_table,
+)
 from wpdc_gwcs.models import PVPolynomial, deproject, project, pv_terms
 from wpdc_gwcs.solution import DistortionSolution
 
@@ -42,6 +48,7 @@ log = logging.getLogger(__name__)
 
 # Alternation ends when no exposure moves by more than this anywhere, px.
 _TOLERANCE = 1e-4
+_DRAFT_TOLERANCE = 1e-2
 _MAX_ROUNDS = 12
 
 # Degree of the smooth surface that stands in for the instrument while outliers are found, and stars
@@ -158,11 +165,14 @@ class InstrumentResult:
         One per exposure given, in that order.
     rejected : dict of str
         Names of the exposures that were left out, and why.
+    table_info : TableInfo or None
+        How the table came about; `None` where there was none to be made.
     """
 
     solution: DistortionSolution
     exposures: tuple
     rejected: dict
+    table_info: TableInfo | None = None
 
 
 def solve_instrument(
@@ -180,6 +190,8 @@ def solve_instrument(
     update=False,
     pool_attitudes=True,
     clip=4.0,
+    table_choice=None,
+    draft=False,
     detector="",
     seed=0,
 ):
@@ -220,6 +232,12 @@ def solve_instrument(
         exceeds the errors.
     clip : float, optional
         Pairs with residuals of more than this many robust standard deviations are left out.
+    table_choice : TableChoice, optional
+        Settings of the table, as found before (``result.table_info.choice``), instead of choosing
+        them again: for pairs of which only a few have changed.
+    draft : bool, optional
+        A table of one kernel on large bins, without uncertainty: for matching again, in a small
+        part of the time.
     detector : str, optional
         Name of the detector.
     seed : int, optional
@@ -306,7 +324,7 @@ def solve_instrument(
     solver = _Solver(pairs, weight, clip, pool=pool_attitudes, seed=seed)
     if solution is None:
         solver.align()
-        solver.solve(cd, degree, n_grid, lut)
+        solver.solve(cd, degree, n_grid, lut, choice=table_choice, draft=draft)
     else:
         solver.attach(solution)
         if update:
@@ -527,20 +545,20 @@ class _Solver:
             self.sigma[:, everyone] = np.sqrt((scale * p.sigma[:, everyone]) ** 2 + floor**2)
             self.error_model = {"scale": scale, "floor": floor}
 
-    def solve(self, cd, degree, n_grid, lut):
+    def solve(self, cd, degree, n_grid, lut, *, choice, draft):
         """PV, table and attitudes in turn."""
         if cd is None:
             cd = np.mean([self.cd[k] for k in self.active], axis=0)
         self.cd0 = np.array(cd, dtype=float)
         self.degree = self._affordable_degree(degree)
         folds = self._folds()
-        choice, places = None, None
+        places, candidates = None, ()
         for self.rounds in range(1, _MAX_ROUNDS + 1):
             self.fit_pv()
             z = self.polynomial_positions(self.pairs.x, self.pairs.y)
             if lut != "none":
                 self.residual_map = self._residual_map(z, folds)
-                if self.rounds == 2:
+                if choice is None and self.rounds == 2 and not draft:
                     choice, candidates = choose_table(self.residual_map, lut=lut)
                 self.table, self.table_info = build_lookup_table(
                     self.residual_map, n_grid, choice=choice, lut=lut, draft=True
@@ -551,9 +569,9 @@ class _Solver:
                 # errors are only now what they are, and the table's settings are chosen with them.
                 self.rescale_errors()
             places, moved = self._places(places)
-            if moved < _TOLERANCE:
+            if moved < (_TOLERANCE if not draft else _DRAFT_TOLERANCE):
                 break
-        if self.table is not None:
+        if self.table is not None and not draft:
             self.residual_map = self._residual_map(z, folds)
             self.table, info = build_lookup_table(self.residual_map, n_grid, choice=choice, lut=lut)
             self.table_info = replace(info, candidates=candidates)
@@ -828,7 +846,8 @@ class _Solver:
                 )
             )
         rejected = {f.name: f.reason for f in fits if f.reason is not None}
-        return InstrumentResult(self._solution(detector, settings, stored), tuple(fits), rejected)
+        solution = self._solution(detector, settings, stored)
+        return InstrumentResult(solution, tuple(fits), rejected, self.table_info)
 
     def _solution(self, detector, settings, stored):
         statistics = {
