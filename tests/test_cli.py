@@ -292,6 +292,21 @@ def test_evaluate_prints_and_writes(results, tmp_path, capsys):
     assert 0.01 < found["sigma_dx"][0] < 0.1
 
 
+def test_report_is_written_once(results, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    assert run(["report", str(results), "--output", str(page)]) == 0
+    assert "report of 2 frames" in capsys.readouterr().out
+    assert "sim-02" in page.read_text()
+    assert run(["report", str(results), "--output", str(page)]) == 2
+    assert "replaced only with --overwrite" in error_of(capsys)
+
+
+def test_missing_plotting_packages_are_named(results, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("wpdc_gwcs.cli.options.find_spec", lambda name: None)
+    assert run(["report", str(results), "--output", str(tmp_path / "page.html")]) == 2
+    assert "needs matplotlib and jinja2, not installed here" in error_of(capsys)
+
+
 def test_monitor_tells_a_changed_table(results, tmp_path, capsys):
     solution = str(results / "sim.solution.asdf")
     assert run(["monitor", solution, str(results)]) == 0

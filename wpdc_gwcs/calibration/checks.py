@@ -11,6 +11,10 @@ __all__ = ["check_solution"]
 _MIN_STARS = 10
 _MAX_SIGMA = 1.0  # px
 
+# Frames of one detector years apart differ by a tenth of a pixel in places: that is in their
+# statistics, and no reason to refuse them.
+_MAX_OFFSET = 0.25  # px
+
 
 def check_solution(frame, matches, instrument):
     """Raise an error unless the solution of a frame agrees with its stars, everywhere.
@@ -69,7 +73,8 @@ def check_solution(frame, matches, instrument):
         n_bins=4,
     )
     settled = count >= 10
-    limit = np.maximum(6 * sigma / np.sqrt(np.where(settled, count, 1)), sigma)
+    noise = 6 * sigma / np.sqrt(np.where(settled, count, 1))
+    limit = np.maximum(noise, max(3 * sigma, _MAX_OFFSET))
     off = settled & (np.hypot(mean_dx, mean_dy) > limit)
     if off.any():
         worst = np.nanmax(np.hypot(mean_dx, mean_dy)[off])

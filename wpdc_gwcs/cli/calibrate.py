@@ -10,7 +10,14 @@ from typing import Annotated
 import typer
 
 from wpdc_gwcs.cli.app import app
-from wpdc_gwcs.cli.options import Config, Overwrite, Preset, Quiet, Verbose
+from wpdc_gwcs.cli.options import (
+    Config,
+    Overwrite,
+    Preset,
+    Quiet,
+    Verbose,
+    require_plotting,
+)
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.exceptions import InputError
 
@@ -149,6 +156,8 @@ def calibrate_command(
     from wpdc_gwcs.io import read, read_frames
     from wpdc_gwcs.solution import DistortionSolution
 
+    if report:
+        require_plotting("--report")
     if update and solution is None:
         raise InputError("--update needs the stored solution: --solution FILE")
     if jobs < 1:
@@ -193,9 +202,8 @@ def calibrate_command(
         )
     results.write(run)
     if report:
-        from wpdc_gwcs.report import write_report
-
-        write_report(output, output / "report.html")
+        tables = {c.frame: c.matches for c in run.calibrations}
+        write_page(run.summary, run.solutions, tables, output / "report.html", overwrite=overwrite)
     if not quiet:
         print_summary(run, output)
     for name, error in run.failures.items():
@@ -204,6 +212,32 @@ def calibrate_command(
         raise typer.Exit(2)
     if run.failures:
         raise typer.Exit(1)
+
+
+def write_page(summary, solutions, matches, path, *, overwrite):
+    """Write the report, whole or not at all.
+
+    Parameters
+    ----------
+    summary : `~astropy.table.Table`
+        One row per frame.
+    solutions : dict
+        Detector name to solution.
+    matches : dict
+        Frame name to match table.
+    path : Path
+        File to write.
+    overwrite : bool
+        Whether it may be replaced.
+    """
+    from wpdc_gwcs.io import atomic_path
+    from wpdc_gwcs.report import write_report
+
+    with (
+        atomic_path(path, overwrite=overwrite) as temporary,
+        temporary.open("w", encoding="utf-8") as file,
+    ):
+        write_report(summary, solutions, matches, file)
 
 
 class Results:

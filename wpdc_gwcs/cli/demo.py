@@ -9,7 +9,7 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.calibrate import Results
-from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose
+from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_plotting
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.exceptions import InputError
 
@@ -114,6 +114,7 @@ def demo_command(
     from wpdc_gwcs.io import read_frames
     from wpdc_gwcs.simulation import simulate
 
+    require_plotting("the demo")
     began = time.perf_counter()
     simulation = simulate(5, distortion=40.0, seed=seed)
     files = write_files(simulation, output / "input", images=(0,), overwrite=overwrite)

@@ -1,4 +1,4 @@
-"""Commands on results: `export`, `pix2sky`, `sky2pix`, `evaluate`, `monitor`."""
+"""Commands on results: `export`, `pix2sky`, `sky2pix`, `evaluate`, `monitor`, `report`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +7,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
-from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free
+from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free, require_plotting
 from wpdc_gwcs.exceptions import InputError
 
 FORMATS = ("fits", "cpdis", "head", "sip", "stock")
@@ -168,6 +168,8 @@ def evaluate_command(
     from wpdc_gwcs.evaluation import evaluate
     from wpdc_gwcs.io import read_matches, write_table
 
+    if plots is not None:
+        require_plotting("--plots")
     rows = []
     for path in match_files(paths):
         matches = read_matches(path)
@@ -293,3 +295,31 @@ def monitor_command(
             )
     if drift.drifted:
         raise typer.Exit(1)
+
+
+@app.command("report", no_args_is_help=True)
+def report_command(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of wpdc calibrate.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", metavar="FILE", help="Page to write; default: DIR/report.html."),
+    ] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+):
+    """Write one self-contained HTML page about a result folder: summary, tables, residuals."""
+    from wpdc_gwcs.cli.calibrate import write_page
+    from wpdc_gwcs.io import read, read_matches, read_table
+
+    require_plotting("the report")
+    output = folder / "report.html" if output is None else output
+    require_free(output, overwrite)
+    summary = read_table(folder / "summary.ecsv")
+    tables = {
+        name: read_matches(folder / f"{name}.matches.ecsv")
+        for name in summary["frame"][summary["status"] == "solved"]
+    }
+    found = [read(path) for path in sorted(folder.glob("*.solution.asdf"))]
+    write_page(summary, {s.detector: s for s in found}, tables, output, overwrite=overwrite)
+    if not quiet:
+        typer.echo(f"{output}: report of {len(summary)} frames")

@@ -2,6 +2,7 @@
 
 import tomllib
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,7 @@ import typer
 from wpdc_gwcs.cli.app import set_verbosity
 from wpdc_gwcs.exceptions import InputError
 
-__all__ = ["Config", "Overwrite", "Preset", "Quiet", "Verbose", "require_free"]
+__all__ = ["Config", "Overwrite", "Preset", "Quiet", "Verbose", "require_free", "require_plotting"]
 
 
 def preset_names():
@@ -129,3 +130,19 @@ def require_free(path, overwrite):
     """
     if path.exists() and not overwrite:
         raise InputError(f"{path}: file exists, and is replaced only with --overwrite")
+
+
+def require_plotting(what):
+    """Refuse to go on without the packages that figures need.
+
+    Parameters
+    ----------
+    what : str
+        What was asked for.
+    """
+    missing = [name for name in ("matplotlib", "jinja2") if find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"{what} needs {' and '.join(missing)}, not installed here: "
+            "pip install 'wpdc_gwcs[plot]'"
+        )

@@ -7,7 +7,7 @@
                                                   Calibration <--read--
 """
 
-from wpdc_gwcs.io.files import OutputExistsError
+from wpdc_gwcs.io.files import OutputExistsError, atomic_path
 from wpdc_gwcs.io.formats import FORMATS, read, read_wcs, write
 from wpdc_gwcs.io.frames import read_frames
 from wpdc_gwcs.io.tables import read_matches, read_table, write_table
@@ -15,6 +15,7 @@ from wpdc_gwcs.io.tables import read_matches, read_table, write_table
 __all__ = [
     "FORMATS",
     "OutputExistsError",
+    "atomic_path",
     "read",
     "read_frames",
     "read_matches",
