@@ -1,0 +1,29 @@
+"""Configuration of the documentation."""
+
+from importlib.metadata import version as _version
+
+from sphinx_astropy.conf.v2 import *  # noqa: F403
+from sphinx_astropy.conf.v2 import exclude_patterns, extensions
+
+project = "wpdc_gwcs"
+author = "The wpdc_gwcs developers"
+copyright = author
+release = _version("wpdc_gwcs")
+version = ".".join(release.split(".")[:2])
+
+exclude_patterns += ["_build"]
+
+# Built without the network: names of other packages are shown, not linked.
+extensions = [e for e in extensions if not e.endswith(("intersphinx", "intersphinx_toggle"))]
+intersphinx_mapping = {}
+
+automodapi_inheritance_diagram = False
+automodapi_toctreedirnm = "reference/api"
+numpydoc_show_class_members = False
+numpydoc_xref_param_type = False
+
+html_theme = "pydata_sphinx_theme"
+html_theme_options = {"show_toc_level": 2, "navigation_with_keys": False}
+html_title = f"wpdc_gwcs {release}"
+html_copy_source = False
+htmlhelp_basename = "wpdc_gwcsdoc"

@@ -1,0 +1,86 @@
+"""The reference pages say what the program does: every command, option, default and name."""
+
+import re
+from pathlib import Path
+
+import pytest
+import typer
+
+import wpdc_gwcs
+from wpdc_gwcs.cli import app
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+COMMANDS = typer.main.get_command(app).commands
+
+
+def read_page(name):
+    return (DOCS / name).read_text(encoding="utf-8")
+
+
+def cli_sections():
+    """Text of the page by command."""
+    parts = re.split(r"^\.\. program:: wpdc (\S+)$", read_page("reference/cli.rst"), flags=re.M)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def documented_options(section):
+    """Text of every ``.. option::`` of a section by its line of names."""
+    parts = re.split(r"^\.\. option:: (.+)$", section, flags=re.M)
+    # The text of an option ends where its indentation does.
+    texts = (re.match(r"\n(?:\n|   .*\n?)*", text)[0] for text in parts[2::2])
+    return {names: " ".join(text.split()) for names, text in zip(parts[1::2], texts, strict=True)}
+
+
+def is_option(parameter):
+    return parameter.opts[0].startswith("-")
+
+
+def test_every_command_is_documented():
+    assert sorted(cli_sections()) == sorted(COMMANDS)
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_option_is_documented(name):
+    expected = {
+        ", ".join(f"{o} {p.metavar}" if p.metavar else o for o in p.opts)
+        for p in COMMANDS[name].params
+        if is_option(p)
+    }
+    assert set(documented_options(cli_sections()[name])) == expected
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_documented_defaults_are_those_of_the_program(name):
+    texts = documented_options(cli_sections()[name])
+    for parameter in filter(is_option, COMMANDS[name].params):
+        text = next(
+            t for names, t in texts.items() if parameter.opts[0] in re.split(r"[ ,]+", names)
+        )
+        takes_value = parameter.metavar is not None
+        if parameter.required:
+            assert text.endswith("Required."), parameter.name
+        elif takes_value and parameter.default is not None:
+            assert text.endswith(f"Default: ``{parameter.default}``."), parameter.name
+        else:
+            assert "Default: ``" not in text, parameter.name
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_arguments_are_documented(name):
+    section = cli_sections()[name]
+    for parameter in COMMANDS[name].params:
+        if not is_option(parameter):
+            assert re.search(rf"^``{re.escape(parameter.metavar)}``$", section, flags=re.M)
+
+
+def test_exit_statuses_are_documented():
+    section = read_page("reference/cli.rst").split("Exit status\n", 1)[1]
+    table = section.split("wpdc calibrate\n", 1)[0]
+    assert re.findall(r"^(\d+) ", table, flags=re.M) == ["0", "1", "2", "130"]
+
+
+def test_every_public_name_is_in_the_api_page():
+    page = read_page("reference/api.rst")
+    for name in wpdc_gwcs.__all__:
+        if not name.startswith("_"):
+            assert re.search(rf"`~wpdc_gwcs\.[\w.]+\.{name}`", page), name
