@@ -191,7 +191,8 @@ def report_random(n, first, max_stars):
     print(
         f"random: {n} cases, {solvable} with >= 30 common stars, {solved} of them solved, "
         f"{few} refused with fewer; silently wrong {wrong}; "
-        f"recall: median {np.median(lowest):.4f}, 1 % {np.quantile(lowest, 0.01):.3f}; {np.mean(seconds):.2f} s each"
+        f"recall: median {np.median(lowest):.4f}, 1 % {np.quantile(lowest, 0.01):.3f}; "
+        f"{np.mean(seconds):.2f} s each"
     )
 
 

@@ -107,20 +107,21 @@ def match_planes(
     if min(ny, nx) < 1:
         raise ValueError(f"image_shape must be two positive numbers (ny, nx); got {image_shape}")
     sources, rows_s, flux, duplicates_s = _prepare("xs", "ys", xs, ys, flux, "flux")
-    reference, rows_r, mag, duplicates_r = _prepare(
-        "xr", "yr", xr, yr, None if mag is None else -np.asarray(mag), "mag"
-    )
+    brightness = None if mag is None else -np.asarray(mag, float)
+    reference, rows_r, brightness, duplicates_r = _prepare("xr", "yr", xr, yr, brightness, "mag")
     errors = _combine_errors(x_err, y_err, len(np.atleast_1d(xs)))
     errors = None if errors is None else errors[rows_s]
     half_diagonal = 0.5 * np.hypot(nx, ny)
     if blind:
-        max_shift, max_scale = 0.3 * max(nx, ny), 0.06
+        max_shift = max(0.3 * max(nx, ny), max_shift or 0.0)
+        max_scale = max(0.06, max_scale)
     elif max_shift is None:
         max_shift = max(450.0, 0.15 * max(nx, ny))
     limits = Limits(max_shift, max_rotation, max_scale, max_distortion, half_diagonal)
     frame = SmoothMap.identity((ny, nx))
     near = np.hypot(*(reference - frame.center).T) < half_diagonal + limits.reach(half_diagonal)
-    reference, rows_r, mag = reference[near], rows_r[near], None if mag is None else mag[near]
+    reference, rows_r = reference[near], rows_r[near]
+    brightness = None if brightness is None else brightness[near]
     for name, points in (
         ("sources", sources),
         ("reference stars in reach of the frame", reference),
@@ -133,17 +134,16 @@ def match_planes(
     stars = Stars.build(reference)
     clock.lap("prepare")
     search = Search(
-        sources,
-        stars,
-        flux,
-        mag,
-        errors,
-        (ny, nx),
-        frame,
-        limits,
-        max_order,
-        min_significance,
-        min_purity,
+        sources=sources,
+        stars=stars,
+        flux=flux,
+        brightness=brightness,
+        errors=errors,
+        shape=(ny, nx),
+        frame=frame,
+        limits=limits,
+        max_order=max_order,
+        rules={"min_significance": min_significance, "min_purity": min_purity},
     )
     found = (
         search.from_start(start, clock) if start is not None else search.by_patterns(blind, clock)

@@ -1,7 +1,6 @@
 """The search: starts from patterns or a given mapping, growth to the whole frame, verdict."""
 
-import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,12 +17,10 @@ from wpdc_gwcs.matching._features import (
     select_coherent,
 )
 from wpdc_gwcs.matching._local import LocalCorrection
-from wpdc_gwcs.matching._mapping import fit_smooth_map, scatter_of
+from wpdc_gwcs.matching._mapping import SmoothMap, fit_smooth_map, scatter_of
 from wpdc_gwcs.matching._pairs import find_edges, find_nearest, one_to_one
 
 __all__ = ["Limits", "Search", "Stars"]
-
-logger = logging.getLogger(__name__)
 
 # Fewer stars than this in either list cannot give evidence whatever they do.
 MIN_STARS = 8
@@ -115,35 +112,23 @@ class Limits:
         )
 
 
+@dataclass(eq=False)
 class Search:
     """One search: two lists and the rules; tries starts until one has evidence."""
 
-    def __init__(
-        self,
-        sources,
-        stars,
-        flux,
-        mag,
-        errors,
-        shape,
-        frame,
-        limits,
-        max_order,
-        min_significance,
-        min_purity,
-    ):
-        self.sources, self.stars, self.flux, self.mag, self.errors = (
-            sources,
-            stars,
-            flux,
-            mag,
-            errors,
-        )
-        self.shape, self.frame, self.limits, self.max_order = shape, frame, limits, max_order
-        self.rules = {"min_significance": min_significance, "min_purity": min_purity}
-        self.best_failure = None
-        self.seen = set()
-        self.n_partial = 0
+    sources: np.ndarray
+    stars: Stars
+    flux: np.ndarray | None
+    brightness: np.ndarray | None
+    errors: np.ndarray | None
+    shape: tuple
+    frame: SmoothMap
+    limits: Limits
+    max_order: int
+    rules: dict
+    best_failure: object = None
+    seen: set = field(default_factory=set)
+    n_partial: int = 0
 
     # starts
 
@@ -225,12 +210,12 @@ class Search:
         """
         ny, nx = self.shape
         everything = np.arange(len(self.sources)), np.arange(len(self.stars.points))
-        if self.flux is not None and self.mag is not None:
+        if self.flux is not None and self.brightness is not None:
             x, y = self.stars.points.T
             inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
             most = _SOURCE_SURPLUS * min(len(self.sources), max(np.count_nonzero(inside), 1))
             by_flux = np.argsort(-self.flux, kind="stable")
-            by_mag = np.argsort(-self.mag, kind="stable")
+            by_mag = np.argsort(-self.brightness, kind="stable")
             counted = np.cumsum(inside[by_mag])
             before = 0
             for level in _LEVELS:
