@@ -7,6 +7,8 @@ import pytest
 import typer
 
 import wpdc_gwcs
+from wpdc_gwcs import detection
+from wpdc_gwcs.calibration import Settings
 from wpdc_gwcs.cli import app
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
@@ -84,3 +86,30 @@ def test_every_public_name_is_in_the_api_page():
     for name in wpdc_gwcs.__all__:
         if not name.startswith("_"):
             assert re.search(rf"`~wpdc_gwcs\.[\w.]+\.{name}`", page), name
+
+
+@pytest.fixture(scope="module")
+def run():
+    simulation = wpdc_gwcs.simulate(1, image_shape=(512, 512), density=100.0, distortion=5.0)
+    catalog = wpdc_gwcs.read_catalog(simulation.reference)
+    frame = simulation.exposures[0].frame(image=True)
+    return wpdc_gwcs.calibrate(frame, catalog, settings=Settings(holdout=0.2, lut="none"))
+
+
+def documented_columns(title):
+    """Names in the first column of the first table below a title of the page of files."""
+    rows = read_page("reference/files.rst").split(f"\n{title}\n", 1)[1].split("\n\n", 2)[1]
+    return [name for row in rows.splitlines() for name in re.findall(r"``(\w+)``", row[:44])]
+
+
+def test_columns_are_documented(run):
+    calibration = run.calibrations[0]
+    assert documented_columns("Matches, ``STEM.matches.ecsv``") == calibration.matches.colnames
+    assert documented_columns("Sources, ``STEM.sources.ecsv``") == calibration.sources.colnames
+    assert documented_columns("Summary, ``summary.ecsv``") == run.summary.colnames
+
+
+def test_flags_are_documented():
+    page = read_page("reference/files.rst")
+    documented = {n: int(v) for v, n in re.findall(r"^(\d+) +``(FLAG_\w+)``", page, flags=re.M)}
+    assert documented == {n: getattr(detection, n) for n in dir(detection) if n.startswith("FLAG_")}
