@@ -1,8 +1,9 @@
 """Errors and warnings of wpdc_gwcs.
 
-Every error that a caller may want to catch derives from `WPDCError`.  Two families matter to pipelines: input that
-cannot be used at all (`InputError`; the command line answers with exit status 2), and a frame that was read but could
-not be solved (`FrameFailure`; exit status 1, the other frames go on).
+Every error that a caller may want to catch derives from `WPDCError`.  Two families matter to
+pipelines: input that cannot be used at all (`InputError`; the command line answers with exit status
+2), and a frame that was read but could not be solved (`FrameFailure`; exit status 1, the other
+frames go on).
 """
 
 from astropy.utils.exceptions import AstropyUserWarning
@@ -63,4 +64,4 @@ class WPDCWarning(AstropyUserWarning):
 
 
 class CentroidWarning(WPDCWarning):
-    """Centroids are of lower quality than asked for (for example windowed instead of PSF-fitted)."""
+    """Centroids are of lower quality than asked for: windowed, for example, not PSF-fitted."""

@@ -75,7 +75,18 @@ class Settings:
             raise ValueError(f"threshold must be positive, got {self.threshold}")
 
     def radial_weight(self, image_shape):
-        """Radial weight for a detector of this shape ``(ny, nx)``."""
-        return RadialWeight(
-            self.weight, r0=0.87 * 0.5 * min(image_shape) if self.r0 is None else self.r0
-        )
+        """Return the radial weight for a detector.
+
+        Parameters
+        ----------
+        image_shape : (int, int)
+            Shape ``(ny, nx)`` in px.
+
+        Returns
+        -------
+        RadialWeight
+            With the radius chosen, or the default one of the detector.
+        """
+        if self.r0 is None:
+            return RadialWeight.for_shape(image_shape, self.weight)
+        return RadialWeight(self.weight, r0=self.r0)

@@ -77,5 +77,16 @@ def solve_linear(design, target, weight=None, *, leverage=False):
 
 
 def robust_sigma(values):
-    """Scatter about zero that outliers do not move: 1.4826 times the median absolute value."""
+    """Scatter about zero that outliers do not move: 1.4826 times the median absolute value.
+
+    Parameters
+    ----------
+    values : (N,) array_like
+        Residuals.
+
+    Returns
+    -------
+    float
+        Scatter in the unit of the values; NaN if there are none.
+    """
     return _MAD_TO_SIGMA * float(np.median(np.abs(values))) if len(values) else np.nan

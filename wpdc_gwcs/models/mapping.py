@@ -226,7 +226,15 @@ class CellGrid:
         return self.y_low, self.y_high
 
     def clip(self, x, y, margin=0.0):
-        """Move points outside the grid onto its rim, or onto a margin around it, in place."""
+        """Move points outside the grid onto its rim, or onto a margin around it, in place.
+
+        Parameters
+        ----------
+        x, y : (N,) ndarray
+            Positions on the grid.
+        margin : float, optional
+            Distance by which points may lie outside.
+        """
         np.maximum(x, self.x_low - margin, out=x)
         np.minimum(x, self.x_high + margin, out=x)
         np.maximum(y, self.y_low - margin, out=y)
@@ -241,6 +249,15 @@ class CellGrid:
     def locate(self, x, y, margin=0.0):
         """Return cell numbers, local coordinates and what is outside by more than the margin.
 
+        Parameters
+        ----------
+        x, y : (N,) ndarray
+            Positions on the grid.
+        margin : float, optional
+            Distance by which points may lie outside.
+
+        Notes
+        -----
         ``outside`` is `None` when every point is inside.
         """
         x_low, x_high = self.x_low - margin, self.x_high + margin
@@ -299,7 +316,15 @@ class CellGrid:
         return outputs
 
     def collapse(self, cell, s):
-        """Return the coefficients ``[k][q]`` of the powers of t that are left when s is given."""
+        """Return the coefficients ``[k][q]`` of the powers of t that are left when s is given.
+
+        Parameters
+        ----------
+        cell : (N,) ndarray of int
+            Cell numbers, see `locate`.
+        s : (N,) ndarray
+            Local coordinates in the cells.
+        """
         coefficients = np.empty((2, self.rows.shape[1], len(s)))
         for rows, outputs in zip(self.rows, coefficients, strict=True):
             for row, output in zip(rows, outputs, strict=True):
@@ -307,7 +332,15 @@ class CellGrid:
         return coefficients
 
     def evaluate_jacobian(self, cell, s, t):
-        """Return both outputs and their derivatives, ``(a, b), (a_x, a_y, b_x, b_y)``."""
+        """Return both outputs and their derivatives, ``(a, b), (a_x, a_y, b_x, b_y)``.
+
+        Parameters
+        ----------
+        cell : (N,) ndarray of int
+            Cell numbers, see `locate`.
+        s, t : (N,) ndarray
+            Local coordinates in the cells.
+        """
         results = [[np.empty_like(s) for _ in range(3)] for _ in range(2)]
         n = self.rows.shape[1]
         for part in _parts(len(s)):
@@ -333,7 +366,15 @@ class CellGrid:
         return [result[0] for result in results], [d for result in results for d in result[1:]]
 
     def transformed(self, matrix, offset=(0.0, 0.0)):
-        """Return the grid with its outputs (a, b) replaced by ``matrix @ (a, b) + offset``."""
+        """Return the grid with its outputs (a, b) replaced by ``matrix @ (a, b) + offset``.
+
+        Parameters
+        ----------
+        matrix : (2, 2) array_like
+            Matrix.
+        offset : (2,) array_like, optional
+            Offset.
+        """
         coefficients = np.einsum("ij,j...->i...", matrix, self.coefficients)
         coefficients[:, 0, 0] += np.reshape(offset, (2, 1, 1))
         return CellGrid(self.x_range, self.y_range, coefficients, smooth=self.smooth)
