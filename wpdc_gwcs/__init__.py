@@ -18,14 +18,23 @@ _PUBLIC = {
     "build_lookup_table": "lookup",
     "build_wcs": "wcs",
     "to_stock_wcs": "wcs",
+    "sky_map": "wcs",
     "DistortionSolution": "solution",
     "Calibration": "solution",
     "calibrate": "calibration",
+    "Settings": "calibration",
     "evaluate": "evaluation",
     "detect_drift": "evaluation",
     "read": "io",
+    "read_frames": "io",
     "write": "io",
     "simulate": "simulation",
+    "plot_cdf": "plotting",
+    "plot_lookup_table": "plotting",
+    "plot_residual_arrows": "plotting",
+    "plot_residual_maps": "plotting",
+    "plot_residuals_vs_position": "plotting",
+    "write_report": "report",
 }
 
 __all__ = sorted([*_PUBLIC, "__version__"])
