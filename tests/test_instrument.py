@@ -93,8 +93,7 @@ class Field:
         )
 
     def solve(self, **options):
-        # Without a table a masking weight would make the corners an extrapolation.
-        weight = RadialWeight("uniform") if options.get("lut") == "none" else WEIGHT
+        weight = None if options.get("lut") == "none" else WEIGHT
         return solve_instrument(
             self.exposures, image_shape=SHAPE, crpix=CRPIX, **{"weight": weight, **options}
         )

@@ -68,6 +68,10 @@ _MIN_COVERAGE = 0.2
 # Fewer exposures do not tell how much attitudes vary.
 _MIN_EXPOSURES_POOL = 5
 
+# How much larger residuals may be in one part of the detector than elsewhere before they are
+# taken for outliers, once the instrument is known.
+_MAX_LOCAL_SCALE = 10.0
+
 # An exposure whose scatter is this many times that of the others has wrong pairs.
 _REJECT_RATIO = 4.0
 
@@ -189,7 +193,7 @@ def solve_instrument(
     solution=None,
     update=False,
     pool_attitudes=True,
-    clip=4.0,
+    clip=3.5,
     table_choice=None,
     draft=False,
     detector="",
@@ -211,7 +215,7 @@ def solve_instrument(
         not given.
     weight : RadialWeight, optional
         Radial weight of the polynomial; ``exp-sqrt`` with 0.87 times half the shorter side if not
-        given.
+        given, and uniform with ``lut="none"``, where no table mends an extrapolation.
     degree : int, optional
         Degree of the PV polynomial.  With fewer than three stars per coefficient inside the weight
         it is lowered.
@@ -313,7 +317,8 @@ def solve_instrument(
         crpix = 0.5 * (np.array(image_shape[::-1]) - 1.0)
     crpix = np.array(crpix, dtype=float)
     if weight is None:
-        weight = RadialWeight.for_shape(image_shape)
+        name = "uniform" if lut == "none" else "exp-sqrt"
+        weight = RadialWeight.for_shape(image_shape, name)
 
     pairs = _Pairs(exposures, image_shape, crpix)
     settings = {
@@ -431,16 +436,51 @@ class _Solver:
             try:
                 fit = fit_attitude(
                     z[0, s], z[1, s], p.ra[s], p.dec[s], crpix=(0.0, 0.0), crval=self.crval[k],
-                    cd=self.cd[k], x_err=self.sigma[0, s], y_err=self.sigma[1, s], clip=self.clip,
-                    used=p.valid[s],
+                    cd=self.cd[k], x_err=self.sigma[0, s], y_err=self.sigma[1, s], clip=np.inf,
+                    used=self.kept[s],
                 )  # fmt: skip
             except FitError as error:
                 self.reject(k, str(error))
                 continue
             self.crval[k], self.cd[k], self.covariance[k] = fit.crval, fit.cd, fit.covariance
             self.residual[0, s], self.residual[1, s] = fit.dx, fit.dy
-            self.kept[s] = fit.used
-            self.scale[k] = float(np.sqrt(np.mean(fit.scale**2)))
+
+    def clip_outliers(self, *, local=np.inf, relax=1.0):
+        """Decide anew which pairs are kept; true where nothing changed.
+
+        A pair is compared with those about it on the detector and with those of its exposure:
+        where the instrument is not yet known, which may be far from where most stars are, all
+        residuals are large, and clipping them would keep it unknown.  ``local`` limits how much
+        larger they may be than elsewhere; ``relax`` multiplies the clipping limit.
+        """
+        p = self.pairs
+        normalised = np.abs(self.residual) / self.sigma
+        usable = p.valid & np.isfinite(normalised).all(0)
+        for k, reason in enumerate(self.reason):
+            if reason is not None:
+                usable[p.slices[k]] = False
+        overall = _scatter(normalised[:, usable])
+        g = int(np.clip(np.sqrt(usable.sum() / 100), 1, 12))
+        ny, nx = p.image_shape
+        x, y = p.x[usable], p.y[usable]
+        cell = np.clip((x + 0.5) * g / nx, 0, g - 1).astype(int) * g
+        cell += np.clip((y + 0.5) * g / ny, 0, g - 1).astype(int)
+        order = np.argsort(cell, kind="stable")
+        scale = np.full(g * g, overall)
+        for part in np.split(order, np.flatnonzero(np.diff(cell[order])) + 1):
+            scale[cell[part[0]]] = _scatter(normalised[:, usable][:, part])
+        limit = np.zeros(len(p))
+        limit[usable] = np.clip(scale[cell], overall, local * overall)
+        for k in self.active:
+            s = p.slices[k]
+            if np.any(usable[s]):
+                self.scale[k] = _scatter(normalised[:, s][:, usable[s]])
+                limit[s] = np.maximum(limit[s], self.scale[k])
+        limit = relax * self.clip * np.maximum(limit, 1e-10)
+        kept = usable & (np.max(np.where(usable, normalised, 0.0), axis=0) <= limit)
+        same = np.array_equal(kept, self.kept)
+        self.kept = kept
+        return same
 
     def reference(self, z):
         """Undistorted position of the reference stars in each exposure's own attitude."""
@@ -474,15 +514,16 @@ class _Solver:
             [a[:, t - j] * b[:, j] for t in range(degree + 1) for j in range(t + 1)], axis=1
         )
         position = np.where(p.finite, np.array([p.x, p.y]) - p.crpix[:, None], 0.0)
-        surface = np.zeros((basis.shape[1], 2))
-        before = None
-        for _ in range(_MAX_ROUNDS):
+        surface, before = np.zeros((basis.shape[1], 2)), None
+        for turn in range(_MAX_ROUNDS):
             z = position + (basis @ surface).T
             self.fit_attitudes(z)
+            # Distortion that is not yet in the surface is not noise: clip little at first.
+            self.clip_outliers(relax=max(1.0, 8.0 / 2**turn))
             target = self.reference(z) - position
             surface = self._fit_surface(basis, target)
             residual = position + (basis @ surface).T - self.reference(z)
-            if before is not None:
+            if turn >= 3:
                 moved = np.sqrt(np.mean((residual - before)[:, self.kept] ** 2))
                 if moved < 1e-2 * np.median(np.abs(residual[:, self.kept])):
                     break
@@ -521,7 +562,7 @@ class _Solver:
     def _scatter(self, k):
         s = self.pairs.slices[k]
         valid = self.pairs.valid[s]
-        return max(robust_sigma(r[s][valid]) for r in self.residual)
+        return _scatter(self.residual[:, s][:, valid])
 
     def rescale_errors(self, n_parameters=None):
         """Scale and floor of the errors from the residuals; see `_error_model`."""
@@ -586,7 +627,10 @@ class _Solver:
         self.table, self.table_sigma = solution.lookup_table, solution.table_sigma
         self.residual_map = solution.residual_map
         z = self.polynomial_positions(self.pairs.x, self.pairs.y)
-        self.settle_attitudes(z)
+        for _ in range(_MAX_ROUNDS):
+            self.fit_attitudes(self.apply_table(z))
+            if self.clip_outliers():
+                break
         self._reject_exposures()
         self.rescale_errors()
         self.settle_attitudes(z)
@@ -700,6 +744,7 @@ class _Solver:
         self.fit_attitudes(z)
         if self.pool:
             self._pool(z)
+        self.clip_outliers(local=_MAX_LOCAL_SCALE)
 
     def _pool(self, z):
         active = self.active
@@ -894,6 +939,11 @@ class _Solver:
             statistics=statistics,
             settings=settings,
         )
+
+
+def _scatter(values):
+    """Robust scatter about zero of the worse of two axes."""
+    return max(robust_sigma(v) for v in values)
 
 
 def _blocks(covariance, n):
