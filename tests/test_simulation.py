@@ -298,7 +298,7 @@ def test_ldac(small, tmp_path):
     with fits.open(files["frames"][0]) as hdus:
         assert [hdu.name for hdu in hdus] == ["PRIMARY", "LDAC_IMHEAD", "LDAC_OBJECTS"]
         np.testing.assert_allclose(
-            hdus[2].data["X_IMAGE"], small.exposures[0].sources["x"] + 1, rtol=1e-12
+            hdus[2].data["XWIN_IMAGE"], small.exposures[0].sources["x"] + 1, rtol=1e-12
         )
     content = files["frames"][0].read_bytes()
     assert b"CTYPE1  = 'RA---TAN'" in content

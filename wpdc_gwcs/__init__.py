@@ -2,8 +2,8 @@
 
 from importlib import import_module
 
-# Public name -> module that defines it.  Resolved on first use (PEP 562), so that `import wpdc_gwcs`,
-# which asdf does for every file it opens, stays light.
+# Public name -> module that defines it.  Resolved on first use (PEP 562), so that to import the
+# package, which asdf does for every file it opens, stays light.
 _PUBLIC = {
     "PVPolynomial": "models",
     "LookupTable": "models",

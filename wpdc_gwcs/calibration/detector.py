@@ -93,7 +93,10 @@ def solve_detector(group, settings, *, holdout=None, solution=None, update=False
             _rematch(frame, result.solution, fit)
             for frame, fit in zip(group, result.exposures, strict=True)
         ]
-        moved = sum(_n_different(a, b) for a, b in zip(pairs, fresh, strict=True))
+        moved = sum(
+            _n_changed(old, new, fit.used)
+            for old, new, fit in zip(pairs, fresh, result.exposures, strict=True)
+        )
         if moved <= _SETTLED * sum(len(i_src) for i_src, _ in pairs):
             break
         pairs = fresh
@@ -206,10 +209,11 @@ def _rematch(frame, solution, fit):
     return pick[i_src], i_ref
 
 
-def _n_different(before, after):
-    """Pairs that are in only one of the two lists."""
-    before, after = ({(int(i), int(j)) for i, j in zip(*p, strict=True)} for p in (before, after))
-    return len(before ^ after)
+def _n_changed(before, after, used):
+    """Count new pairs and lost ones; what the fit had not used is no loss."""
+    before, after = (np.array(p, np.int64).T for p in (before, after))
+    key = [p[:, 0] << 32 | p[:, 1] for p in (before, after)]
+    return int(np.sum(~np.isin(key[1], key[0])) + np.sum(~np.isin(key[0][used], key[1])))
 
 
 def _calibration(frame, pairs, fit, instrument, settings, holdout, seconds):

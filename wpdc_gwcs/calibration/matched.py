@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 _MAX_ROUNDNESS = 0.3
 _MIN_SNR = 10.0
 
+_ERROR_FLOOR = 0.01  # px
+
 
 @dataclass(frozen=True, eq=False)
 class MatchedFrame:
@@ -132,6 +134,7 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     began = time.perf_counter()
     if sources is None:
         sources = measure_sources(frame, settings)
+    sources = _with_errors(sources)
     usable = _usable(sources, frame.image_shape)
     x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)
     if solution is None:
@@ -191,6 +194,17 @@ def optional_column(table, name, rows=slice(None)):
         Values.
     """
     return np.asarray(table[name], dtype=float)[rows] if name in table.colnames else None
+
+
+def _with_errors(sources):
+    """Add errors by signal-to-noise where a list has none; their scale is fitted later."""
+    if "snr" not in sources.colnames or {"x_err", "y_err"} <= set(sources.colnames):
+        return sources
+    sources = sources.copy()
+    # A star of FWHM 2.4 px has a centroid error of 1 / snr px, and no centroid is perfect.
+    error = np.hypot(1.0 / np.maximum(np.asarray(sources["snr"], float), 1.0), _ERROR_FLOOR)
+    sources["x_err"] = sources["y_err"] = error
+    return sources
 
 
 def _usable(sources, image_shape):

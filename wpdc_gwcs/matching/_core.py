@@ -12,6 +12,12 @@ from wpdc_gwcs.matching._search import MIN_STARS, Limits, Search, Stars
 __all__ = ["match_planes"]
 
 
+# Displacement by distortion that is searched for, px; on a small detector as a share of its side:
+# what such a limit allows in scale and rotation grows as the detector shrinks.
+_MAX_DISTORTION = 250.0
+_MAX_DISTORTION_SHARE = 0.12
+
+
 def match_planes(
     xs,
     ys,
@@ -28,7 +34,7 @@ def match_planes(
     max_shift=None,
     max_rotation=3.0,
     max_scale=0.03,
-    max_distortion=250.0,
+    max_distortion=None,
     max_order=MAX_ORDER,
     min_significance=9.0,
     min_purity=0.9,
@@ -64,8 +70,9 @@ def match_planes(
         Largest error of the rotation at the centre of the frame, deg.
     max_scale : float
         Largest relative error of the scale at the centre of the frame.
-    max_distortion : float
-        Largest displacement by distortion on the frame, px.
+    max_distortion : float, optional
+        Largest displacement by distortion on the frame, px; default 250, and at most 0.12 of the
+        longer side.
     max_order : int
         Highest order of the smooth mapping.
     min_significance : float
@@ -117,6 +124,8 @@ def match_planes(
         max_scale = max(0.06, max_scale)
     elif max_shift is None:
         max_shift = max(450.0, 0.15 * max(nx, ny))
+    if max_distortion is None:
+        max_distortion = min(_MAX_DISTORTION, _MAX_DISTORTION_SHARE * max(image_shape))
     limits = Limits(max_shift, max_rotation, max_scale, max_distortion, half_diagonal)
     frame = SmoothMap.identity((ny, nx))
     near = np.hypot(*(reference - frame.center).T) < half_diagonal + limits.reach(half_diagonal)

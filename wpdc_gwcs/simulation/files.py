@@ -84,8 +84,8 @@ def _write_ldac(exposure, path):
     )
     imhead.header["TFORM1"] = f"{text.size}A"
     columns = {
-        "X_IMAGE": s["x"] + 1,  # FITS_LDAC counts pixels from 1
-        "Y_IMAGE": s["y"] + 1,
+        "XWIN_IMAGE": s["x"] + 1,  # FITS_LDAC counts pixels from 1
+        "YWIN_IMAGE": s["y"] + 1,
         "ERRAWIN_IMAGE": s["x_err"],
         "ERRBWIN_IMAGE": s["y_err"],
         "ERRTHETAWIN_IMAGE": np.zeros(len(s)),
