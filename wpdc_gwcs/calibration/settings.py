@@ -52,7 +52,7 @@ class Settings:
     r0: float | None = None
     n_grid: int = 50
     lut: str = "auto"
-    refine: str = "auto"
+    refine: str = "attitude"
     centroids: str = "psf"
     reference_point: str = "header"
     threshold: float = 5.0

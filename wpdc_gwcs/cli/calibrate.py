@@ -46,7 +46,7 @@ def calibrate_command(
     frames: Annotated[
         list[str],
         typer.Argument(
-            metavar="FRAME...",
+            metavar="FRAME",
             help="FITS images (path or path[EXT]), FITS_LDAC lists, or source tables with --wcs.",
         ),
     ],
@@ -71,8 +71,12 @@ def calibrate_command(
     ] = False,
     refine: Annotated[
         str,
-        typer.Option(metavar="{auto,attitude,pv}", help="What is fitted for each exposure."),
-    ] = "auto",
+        typer.Option(
+            metavar="{auto,attitude,pv}",
+            help="What is fitted per exposure: six linear numbers, its own polynomial too, or what "
+            "predicts left-out stars better.",
+        ),
+    ] = "attitude",
     lut: Annotated[
         str,
         typer.Option(
