@@ -208,6 +208,7 @@ def plot_lookup_table(table):
         ],
         extent,
         (y[-1] - y[0], x[-1] - x[0]),
+        level=100,
     )
     for axes in figure.axes[:3]:
         axes.set_xlim(x[0], x[-1])
@@ -249,7 +250,7 @@ def plot_cdf(matches):
     axes.set_ylim(0, 1)
     axes.set_xlabel("residual [px]")
     axes.set_ylabel("cumulative share of the stars")
-    axes.legend(loc="upper left", frameon=False, fontsize="small")
+    axes.legend(loc="upper left", edgecolor="none", framealpha=1, fontsize="small")
     return figure
 
 
@@ -273,13 +274,17 @@ def _frame_detector(axes, image_shape):
     axes.set_ylabel("y [px]")
 
 
-def _draw_maps(maps, extent, image_shape):
-    """Draw maps beside each other; the signed ones share a scale that is symmetric about zero."""
+def _draw_maps(maps, extent, image_shape, *, level=99):
+    """Draw maps beside each other.
+
+    The signed ones share a scale that is symmetric about zero and ends at a percentile, so that a
+    cell with one bad star does not hide the others.
+    """
     ny, nx = image_shape
-    figure = _new_figure(11.5, 11.5 / 3 * min(ny / nx, 1.6) + 0.75)
+    figure = _new_figure(11.5, 11.5 / 3 * min(ny / nx, 1.6) + 1.1)
     panels = figure.subplots(1, len(maps), sharey=True)
     signed = np.abs(np.concatenate([values.ravel() for values, _, sign in maps if sign]))
-    top = float(np.nanpercentile(signed, 99)) if np.isfinite(signed).any() else 0.0
+    top = float(np.nanpercentile(signed, level)) if np.isfinite(signed).any() else 0.0
     top = top or 1.0
     for axes, (values, label, sign) in zip(panels, maps):
         options = {"cmap": _DIVERGING, "vmin": -top, "vmax": top} if sign else {"cmap": _SEQUENTIAL}
@@ -339,11 +344,9 @@ def _running_percentiles(position, values, *, n_bins=25):
 
 def _symmetric_limit(*residuals):
     """Limit of an axis that shows residuals: five times their scatter, about zero."""
-    spread = [
-        max(abs(stats.mean_dx), abs(stats.mean_dy)) + 5 * max(stats.scatter_dx, stats.scatter_dy)
-        for stats in [evaluate(*residuals)]
-    ]
-    limit = np.nanmax(spread, initial=0.0)
+    stats = evaluate(*residuals)
+    limit = max(abs(stats.mean_dx), abs(stats.mean_dy))
+    limit += 5 * max(stats.scatter_dx, stats.scatter_dy)
     return limit if limit > 0 else 1.0
 
 
