@@ -245,7 +245,17 @@ def write_page(summary, solutions, matches, path, *, overwrite):
 
 
 class Results:
-    """Files of one calibration: checked before the work begins, written after it."""
+    """Files of one calibration: checked before the work begins, written after it.
+
+    Parameters
+    ----------
+    folder : Path
+        Output folder.
+    frames : list of Frame
+        Frames to be calibrated.
+    overwrite : bool
+        Whether files may be replaced.
+    """
 
     def __init__(self, folder, frames, *, overwrite):
         self.folder = folder
@@ -281,7 +291,13 @@ class Results:
             ) from err
 
     def require_free(self, name):
-        """Refuse to go on if this file is there and may not be replaced."""
+        """Refuse to go on if a file is there and may not be replaced.
+
+        Parameters
+        ----------
+        name : str
+            Name of the file in the folder.
+        """
         path = self.folder / name
         if path.is_dir():
             raise InputError(f"{path}: is a folder, and a file of this name would be written")
@@ -289,7 +305,13 @@ class Results:
             raise InputError(f"{path}: file exists, and is replaced only with --overwrite")
 
     def write(self, run):
-        """Write all files; each is complete or not there."""
+        """Write all files; each is complete or not there.
+
+        Parameters
+        ----------
+        run : CalibrationRun
+            What was found.
+        """
         from wpdc_gwcs.io import write, write_table
 
         for calibration in run.calibrations:
@@ -313,13 +335,35 @@ class Results:
 
 
 def file_stem(detector):
-    """File name for a detector, whatever characters its name has."""
+    """Make a file name of a detector's name, whatever characters it has.
+
+    Parameters
+    ----------
+    detector : str
+        Name of the detector.
+
+    Returns
+    -------
+    str
+        Name without characters that a file system may refuse.
+    """
     return "".join(c if c.isalnum() or c in "._-" else "_" for c in detector)
 
 
 @contextmanager
 def executor(address):
-    """Executor of the Dask cluster at this address, or None."""
+    """Connect to the Dask cluster at an address.
+
+    Parameters
+    ----------
+    address : str or None
+        Address of its scheduler.
+
+    Yields
+    ------
+    concurrent.futures.Executor or None
+        None without an address.
+    """
     if address is None:
         yield None
         return
@@ -338,7 +382,15 @@ def executor(address):
 
 
 def print_summary(run, folder):
-    """Print a line per frame and what was written."""
+    """Print a line per frame and what was written.
+
+    Parameters
+    ----------
+    run : CalibrationRun
+        What was found.
+    folder : Path
+        Where the results are.
+    """
     width = max([len("frame"), *(len(name) for name in run.summary["frame"])])
     typer.echo(
         f"{'frame':<{width}}  status  sources  matched  sigma_dx  sigma_dy  rms_mas  seconds"

@@ -109,4 +109,9 @@ def match_command(
     )
     write_table(table, output, overwrite=overwrite)
     if not quiet:
-        typer.echo(f"{output}: {len(table)} pairs; {matched.diagnostics}")
+        found = matched.diagnostics
+        typer.echo(
+            f"{output}: {len(table)} pairs, {found.expected_by_chance:.1f} expected by chance "
+            f"({found.significance:.1f} sigma), purity {found.purity:.4f}, "
+            f"{found.n_ambiguous} ambiguous left out"
+        )
