@@ -348,14 +348,11 @@ class TableChoice:
     freedom: float = 0.0
 
 
-# Kernel, shape parameters and least degree of its polynomial.  The Gaussian of length l has epsilon
-# = 1 / (sqrt(2) l): lengths from three times the detector (all but a polynomial) to a thirteenth of
-# it.
-_KERNELS = (
-    ("thin_plate_spline", (1.0,), 1),
-    ("quintic", (1.0,), 2),
-    ("gaussian", (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.5, 9.0), 1),
-)
+# Kernel, shape parameter and least degree of its polynomial.  The Gaussian of length l has
+# epsilon = 1 / (sqrt(2) l): from three times the detector to a thirteenth of it.
+_BROAD_KERNELS = tuple(("gaussian", epsilon, 1) for epsilon in (0.25, 0.5, 1.0, 2.0))
+_OPEN_KERNELS = (("thin_plate_spline", 1.0, 1), ("gaussian", 4.0, 1))
+_NARROW_KERNELS = tuple(("gaussian", epsilon, 1) for epsilon in (3.0, 5.0, 6.0, 7.5, 9.0))
 _MAX_DEGREE = 7
 
 # Gaussians up to this epsilon are worth a low-rank factor; what it leaves out of a unit diagonal.
@@ -367,6 +364,9 @@ _SMOOTHINGS = 10.0 ** np.arange(-10.0, 3.01, 0.5)
 
 # Nodes of the pilot surface along each axis.
 _PILOT_NODES = 51
+
+# Gain of generalised cross-validation at which kernels of short length are tried.
+_NARROW_GAIN = 0.998
 
 # Candidates that go from generalised cross-validation on to cross-validation over exposures.
 _N_SHORTLIST = 4
@@ -718,11 +718,19 @@ def _choose(coarse, *, allow_none):
     quintic = _Spectrum(bins, "quintic", 1.0, 2)
     pilot = _pilot(bins, _first_choice(bins, quintic))
     value = bins.debiased(pilot)
-    found = _best_of(quintic, value)
+    narrow = _best_of(quintic, value)
     del quintic
-    for kernel, epsilons, least_degree in _KERNELS:
-        for epsilon in epsilons:
-            found += _best_of(_Spectrum(bins, kernel, epsilon, least_degree), value)
+
+    def try_all(kernels):
+        return [c for k in kernels for c in _best_of(_Spectrum(bins, *k), value)]
+
+    broad = try_all(_BROAD_KERNELS)
+    narrow += try_all(_OPEN_KERNELS)
+    # Splines and the medium length take structure of every size: where they are no better than the
+    # broad kernels there is none for the narrow ones.
+    if min(c.score for c in narrow) < _NARROW_GAIN * min(c.score for c in broad):
+        narrow += try_all(_NARROW_KERNELS)
+    found = broad + narrow
     found.sort(key=lambda c: c.score)
     candidates = [TableChoice("none"), *_distinct(found)]
     scores = _cross_validate(coarse, candidates, pilot)
