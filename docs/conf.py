@@ -2,8 +2,8 @@
 
 from importlib.metadata import version as _version
 
-from sphinx_astropy.conf.v2 import *  # noqa: F403
-from sphinx_astropy.conf.v2 import exclude_patterns, extensions
+from sphinx_astropy.conf.v3 import *  # noqa: F403
+from sphinx_astropy.conf.v3 import exclude_patterns, extensions
 
 project = "wpdc_gwcs"
 author = "The wpdc_gwcs developers"
@@ -22,8 +22,6 @@ automodapi_toctreedirnm = "reference/api"
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = False
 
-html_theme = "pydata_sphinx_theme"
-html_theme_options = {"show_toc_level": 2, "navigation_with_keys": False}
 html_title = f"wpdc_gwcs {release}"
 html_copy_source = False
 htmlhelp_basename = "wpdc_gwcsdoc"
