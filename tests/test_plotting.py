@@ -58,6 +58,21 @@ def test_arrows_show_the_mean_of_each_cell(saved):
     assert f"{np.hypot(0.02, 0.01):.2g} px" in title
 
 
+def test_arrows_stay_in_the_picture(rng):
+    x, y = np.meshgrid(np.linspace(0, 999, 60), np.linspace(0, 799, 60))
+    dx, dy = rng.standard_t(3, (2, x.size))
+    figure = plotting.plot_residual_arrows(x.ravel(), y.ravel(), dx, dy, image_shape=SHAPE)
+    axes = figure.axes[0]
+    quiver = next(c for c in axes.collections if hasattr(c, "U"))
+    for start, arrow, (low, high) in (
+        (quiver.X, quiver.U, axes.get_xlim()),
+        (quiver.Y, quiver.V, axes.get_ylim()),
+    ):
+        tip = start + arrow / quiver.scale
+        assert low < tip.min()
+        assert tip.max() < high
+
+
 def test_arrows_without_stars(saved):
     saved(plotting.plot_residual_arrows([], [], [], [], image_shape=SHAPE))
 

@@ -58,8 +58,9 @@ def plot_residual_arrows(x, y, dx, dy, *, image_shape, title=None, n_bins=20):
     iy, ix = np.nonzero(filled)
     u, v = u[filled], v[filled]
     length = np.hypot(u, v)
-    # A typical arrow is as long as a cell; the key is a round number near it.
-    typical = float(np.percentile(length, 80)) if length.size else 0.0
+    # A typical arrow is as long as a cell, the longest one has room beside the outer cells; the key
+    # is a round number near the typical one.
+    typical = float(max(np.percentile(length, 80), length.max() / 1.9)) if length.size else 0.0
     typical = typical or 1.0
 
     figure = _new_figure(6.0, 6.0 * ny / nx + 0.7)
@@ -82,8 +83,9 @@ def plot_residual_arrows(x, y, dx, dy, *, image_shape, title=None, n_bins=20):
     )
     _frame_detector(axes, image_shape)
     # Arrows of the outer cells may reach over the edge.
-    axes.set_xlim(-0.5 - cell[0], nx - 0.5 + cell[0])
-    axes.set_ylim(-0.5 - cell[1], ny - 0.5 + cell[1])
+    margin = 1.5 * cell.min()
+    axes.set_xlim(-0.5 - margin, nx - 0.5 + margin)
+    axes.set_ylim(-0.5 - margin, ny - 0.5 + margin)
     rms = np.sqrt(np.mean(length**2)) if length.size else np.nan
     axes.set_title(f"{title or 'Residuals'}\ncell means, rms {_format_px(rms)} px", loc="left")
     return figure
