@@ -110,6 +110,21 @@ def test_stored_solution_of_another_shape_is_refused(simulation, catalog, run):
     assert "stored solution is for (1024, 1024)" in str(found.failures[frame.name])
 
 
+def test_stored_solution_of_another_detector_is_refused(simulation, catalog, run):
+    frame = replace(simulation.exposures[0].frame(), detector="other")
+    found = calibrate(frame, catalog, solution=run.solutions["sim"])
+    assert "detector 'other', the stored solution of 'sim'" in str(found.failures[frame.name])
+
+
+def test_stored_solution_that_does_not_fit_is_refused(simulation, catalog, run):
+    stored = run.solutions["sim"]
+    pv = stored.pv.copy()
+    pv.pv1_4 = pv.pv1_4.value + 0.15  # 3 px at the edges
+    found = calibrate(simulation.exposures[0].frame(), catalog, solution=replace(stored, pv=pv))
+    assert not found.calibrations
+    assert "solution by 0.0" in str(found.failures["sim-01"])
+
+
 def test_a_frame_that_fails_leaves_the_others_alone(simulation, catalog):
     good = simulation.exposures[0].frame()
     rng = np.random.default_rng(8)

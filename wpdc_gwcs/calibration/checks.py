@@ -15,8 +15,11 @@ _MAX_SIGMA = 1.0  # px
 # statistics, and no reason to refuse them.
 _MAX_OFFSET = 0.25  # px
 
+# Bad seeing makes centroids worse than those a stored solution was made of, but not this much.
+_STORED_RATIO = 5.0
 
-def check_solution(frame, matches, instrument):
+
+def check_solution(frame, matches, instrument, *, stored=None):
     """Raise an error unless the solution of a frame agrees with its stars, everywhere.
 
     Parameters
@@ -27,6 +30,8 @@ def check_solution(frame, matches, instrument):
         Columns ``x``, ``y``, residuals ``dx``, ``dy`` in px, and ``used``.
     instrument : DistortionSolution
         The distortion the frame was solved with.
+    stored : DistortionSolution, optional
+        The stored solution, where the frame had to take its distortion as it is.
 
     Raises
     ------
@@ -51,6 +56,12 @@ def check_solution(frame, matches, instrument):
         raise FitError(
             f"{frame.source}: the residuals scatter by {sigma:.2f} px, at most {_MAX_SIGMA} px are "
             "accepted"
+        )
+    expected = None if stored is None else stored.statistics.get("sigma_px")
+    if expected is not None and sigma > max(_STORED_RATIO * expected, _MAX_OFFSET):
+        raise FitError(
+            f"{frame.source}: the residuals scatter by {sigma:.2f} px, those of the stored "
+            f"solution by {expected:.2f} px: it is not that of this detector, or no longer"
         )
     ny, nx = frame.image_shape
     x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, 33), np.linspace(-0.5, ny - 0.5, 33))

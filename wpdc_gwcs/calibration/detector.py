@@ -70,7 +70,15 @@ def solve_detector(group, settings, *, holdout=None, solution=None, update=False
     began = time.perf_counter()
     shape = group[0].image_shape
     crpix = _instrument_crpix(group[0], settings) if solution is None else solution.crpix
-    attitudes = [_attitude_of_pairs(frame, crpix) for frame in group]
+    failures, attitudes = {}, []
+    for frame in group:
+        try:
+            attitudes.append(_attitude_of_pairs(frame, crpix))
+        except FitError as err:
+            failures[frame.name] = err
+    group = [frame for frame in group if frame.name not in failures]
+    if not group:
+        raise next(iter(failures.values()))
     pairs = [frame.pairs for frame in group]
     for attempt in range(_MAX_REMATCH):
         result = solve_instrument(
@@ -108,16 +116,21 @@ def solve_detector(group, settings, *, holdout=None, solution=None, update=False
     instrument = replace(
         result.solution, provenance={**result.solution.provenance, **_provenance(group)}
     )
-    calibrations, failures = [], {}
+    calibrations, stored = [], None if update else solution
     for frame, found, fit in zip(group, pairs, result.exposures, strict=True):
         try:
             calibrations.append(
-                _calibration(frame, found, fit, instrument, settings, holdout, seconds)
+                _calibration(frame, found, fit, instrument, settings, holdout, seconds, stored)
             )
         except FitError as err:
             failures[frame.name] = err
     if not calibrations:
         raise next(iter(failures.values()))
+    if solution is None or update:
+        scatter = [c.statistics["residuals"] for c in calibrations]
+        instrument.statistics["sigma_px"] = float(
+            np.median([max(s["sigma_dx"], s["sigma_dy"]) for s in scatter])
+        )
     return instrument, calibrations, failures
 
 
@@ -216,7 +229,7 @@ def _n_changed(before, after, used):
     return int(np.sum(~np.isin(key[1], key[0])) + np.sum(~np.isin(key[0][used], key[1])))
 
 
-def _calibration(frame, pairs, fit, instrument, settings, holdout, seconds):
+def _calibration(frame, pairs, fit, instrument, settings, holdout, seconds, stored):
     """Make the result of one frame, if its solution passes its own checks."""
     if fit.reason is not None:
         raise FitError(f"{frame.source}: {fit.reason}")
@@ -242,7 +255,7 @@ def _calibration(frame, pairs, fit, instrument, settings, holdout, seconds):
             "holdout": held,
         }
     )
-    check_solution(frame, matches, instrument)
+    check_solution(frame, matches, instrument, stored=stored)
     residuals = evaluate(fit.dx[fit.used], fit.dy[fit.used])
     scale = np.sqrt(abs(np.linalg.det(fit.cd))) * 3.6e6
     statistics = {

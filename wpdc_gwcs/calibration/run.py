@@ -9,6 +9,7 @@ from multiprocessing import get_context
 
 import numpy as np
 from astropy.table import QTable
+from threadpoolctl import threadpool_limits
 
 from wpdc_gwcs.calibration.detector import solve_detector
 from wpdc_gwcs.calibration.matched import match_frame, measure_sources
@@ -40,6 +41,12 @@ class CalibrationRun:
     summary: QTable = field(repr=False)
 
 
+# The matrices are small: threads of the linear algebra library gain little on an idle machine, and
+# waiting for each other cost several times the work on a busy one.  Frames run in parallel instead.
+_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+
+
+@_one_thread
 def calibrate(
     frames,
     catalog,
@@ -135,6 +142,7 @@ class FailedFrame:
     seconds: float
 
 
+@_one_thread
 def _match_or_fail(frame, catalog, solution, settings):
     began = time.perf_counter()
     sources = ()
@@ -194,6 +202,11 @@ def _stored_for(solution, frame):
         raise FitError(
             f"{frame.source}: the frame has shape (ny, nx) {tuple(frame.image_shape)}, the stored "
             f"solution is for {tuple(solution.image_shape)}"
+        )
+    if solution is not None and frame.detector != solution.detector:
+        raise FitError(
+            f"{frame.source}: the frame is of detector {frame.detector!r}, the stored solution of "
+            f"{solution.detector!r}; if they are one, name it (--detector {solution.detector})"
         )
     return solution
 
