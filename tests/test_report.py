@@ -25,8 +25,9 @@ class Tags(HTMLParser):
         self.sources += [value for name, value in attrs if name == "src"]
 
 
-@pytest.fixture
-def page(rng):
+@pytest.fixture(scope="module")
+def page():
+    rng = np.random.default_rng(5)
     summary = QTable(
         {
             "frame": ["good", "<bad>"],
