@@ -9,16 +9,8 @@ from scipy.interpolate import RBFInterpolator
 
 from wpdc_gwcs import ResidualMap, build_lookup_table
 from wpdc_gwcs.exceptions import FitError
-from wpdc_gwcs.lookup import (
-    N_FOLDS,
-    TableChoice,
-    _Bins,
-    _kernel,
-    _polynomials,
-    _solve,
-    _Spectrum,
-    choose_table,
-)
+from wpdc_gwcs.lookup import N_FOLDS, TableChoice, choose_table
+from wpdc_gwcs.lookup.smoother import Bins, Spectrum, kernel_matrix, polynomials, smooth_surface
 
 SHAPE = (1500, 2048)
 
@@ -58,7 +50,7 @@ class TestResidualMap:
         assert_allclose(one.centroid[:, 0, 0], [np.average(p, weights=w) for p in (x, y)])
         expected = [np.sqrt(np.sum((w * e) ** 2)) / w.sum() for e in (error, 2 * error)]
         assert_allclose(one.sigma[:, 0, 0], expected)
-        bins = _Bins(one)
+        bins = Bins(one)
         half = 1024.0
         assert_allclose(
             bins.moments[:, 0] * half**2,
@@ -154,14 +146,14 @@ class TestNumerics:
         [("thin_plate_spline", 1.0, 3), ("quintic", 1.0, 2), ("gaussian", 3.0, 1)],
     )
     def test_surface_equals_scipy(self, rng, kernel, epsilon, degree):
-        bins = _Bins(make_map(rng, 600).coarsen(4))
+        bins = Bins(make_map(rng, 600).coarsen(4))
         choice = TableChoice(kernel, degree, 1e-2, epsilon)
         u, v = rng.uniform(-1, 1, (2, 50))
         expected = RBFInterpolator(
             np.stack([bins.u, bins.v], axis=1), bins.value, kernel=kernel, epsilon=epsilon,
             degree=degree, smoothing=1e-2 * bins.variance,
         )(np.stack([u, v], axis=1))  # fmt: skip
-        assert_allclose(_solve(bins, bins.value, choice)(u, v), expected, atol=1e-7)
+        assert_allclose(smooth_surface(bins, bins.value, choice)(u, v), expected, atol=1e-7)
 
     @pytest.mark.parametrize(
         ("kernel", "epsilon", "least"),
@@ -171,17 +163,17 @@ class TestNumerics:
         ],
     )  # fmt: skip
     def test_generalised_cross_validation(self, rng, kernel, epsilon, least):
-        bins = _Bins(make_map(rng, 400).coarsen(4))
+        bins = Bins(make_map(rng, 400).coarsen(4))
         m = len(bins)
-        spectrum = _Spectrum(bins, kernel, epsilon, least)
+        spectrum = Spectrum(bins, kernel, epsilon, least)
         relative = np.array([1e-6, 1e-3, 1.0])
         smoothing = relative * spectrum.eigenvalues.max()
         degrees = [least, 4]
         found = spectrum.scores(bins.value, smoothing, degrees)
         for degree, (scores, freedom) in zip(degrees, found):
-            basis = _polynomials(bins.u, bins.v, degree)
+            basis = polynomials(bins.u, bins.v, degree)
             for s, score, free in zip(smoothing, scores, freedom):
-                k = _kernel(kernel, epsilon, bins.u, bins.v, bins.u, bins.v)
+                k = kernel_matrix(kernel, epsilon, bins.u, bins.v, bins.u, bins.v)
                 p = basis.shape[1]
                 k += s * np.diag(bins.variance)
                 system = np.block([[k, basis], [basis.T, np.zeros((p, p))]])

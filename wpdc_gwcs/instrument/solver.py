@@ -1,50 +1,28 @@
-"""One instrument, many exposures: PV and table of a detector, six numbers for each frame.
-
-::
-
-    pairs of all exposures --align--> attitudes, outliers, errors
-        --+--> PV (distance-weighted) --> residual maps --> table --> attitudes --+--> solution
-          +------------------------- until nothing moves -------------------------+
-
-The distortion is a property of the detector and stable; CRVAL and CD belong to the exposure.  A
-polynomial of its own for each exposure, the paper's first phase, carries that exposure's star noise
-into the corners; one for all does not.
-
-Gauge: the PV polynomial has no constant and unit linear terms, so that CRVAL is the sky at CRPIX
-and CD the local scale there.  What a fit puts into these terms is moved into the attitudes,
-exactly.
-"""
+"""The alternation of attitudes, polynomial and table."""
 
 import logging
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from scipy.optimize import nnls
-from scipy.spatial import ConvexHull, QhullError
 
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.fitting import (
     MIN_STARS_ATTITUDE,
-    RadialWeight,
     WPDCFitter,
     fit_attitude,
     robust_sigma,
     solve_linear,
 )
-from wpdc_gwcs.lookup import (
-    N_FOLDS,
-    ResidualMap,
-    TableInfo,
-    build_lookup_table,
-    choose_table,
-)
+from wpdc_gwcs.instrument.errors import attitude_variance, error_model, pool_linear, worse_scatter
+from wpdc_gwcs.instrument.exposure import ExposureFit, InstrumentResult
+from wpdc_gwcs.instrument.pairs import check_coverage
+from wpdc_gwcs.lookup import N_FOLDS, ResidualMap, build_lookup_table, choose_table
 from wpdc_gwcs.models import PVPolynomial, deproject, project, pv_terms
 from wpdc_gwcs.solution import DistortionSolution
 
-__all__ = ["Exposure", "ExposureFit", "InstrumentResult", "solve_instrument"]
-
 log = logging.getLogger(__name__)
+
 
 # Alternation ends when no exposure moves by more than this anywhere, px.
 _TOLERANCE = 1e-4
@@ -62,9 +40,6 @@ _MAX_SCATTER = 2.0
 # Uncertainty at the far corner of the detector beyond which an attitude is not delivered, px.
 _MAX_CORNER_SIGMA = 1.0
 
-# Smallest share of the detector that the stars' outline covers.
-_MIN_COVERAGE = 0.2
-
 # Fewer exposures do not tell how much attitudes vary.
 _MIN_EXPOSURES_POOL = 5
 
@@ -76,323 +51,7 @@ _MAX_LOCAL_SCALE = 10.0
 _REJECT_RATIO = 4.0
 
 
-@dataclass(frozen=True, eq=False)
-class Exposure:
-    """Pairs of one exposure, and where it was thought to point.
-
-    Parameters
-    ----------
-    name : str
-        Name of the exposure, for messages.
-    x, y : (N,) array_like
-        Measured positions, px, zero based.
-    ra, dec : (N,) array_like
-        Reference positions at the epoch of the exposure, deg.
-    crval : (2,) array_like
-        Starting RA and Dec of the reference point, deg.
-    cd : (2, 2) array_like
-        Starting linear matrix, deg / px.
-    x_err, y_err : (N,) array_like, optional
-        Total 1-sigma errors (centroid and reference), px; estimated from the residuals if not
-        given.
-    use : (N,) array_like of bool, optional
-        Stars that may be fitted; the others (held out) only get residuals.
-    """
-
-    name: str
-    x: np.ndarray
-    y: np.ndarray
-    ra: np.ndarray
-    dec: np.ndarray
-    crval: np.ndarray
-    cd: np.ndarray
-    x_err: np.ndarray | None = None
-    y_err: np.ndarray | None = None
-    use: np.ndarray | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ExposureFit:
-    """What the joint solution found for one exposure.
-
-    Parameters
-    ----------
-    name : str
-        Name of the exposure.
-    crval : (2,) ndarray
-        RA and Dec of the reference point, deg.
-    cd : (2, 2) ndarray
-        Linear matrix, deg / px.
-    covariance : (6, 6) ndarray
-        Of the errors (ax, bxx, bxy, ay, byx, byy), see `wpdc_gwcs.fitting.AttitudeFit`.
-    dx, dy : (N,) ndarray
-        Residuals X'' - X_ref, Y'' - Y_ref of all pairs given, undistorted px; NaN where a position
-        is NaN.
-    x_err, y_err : (N,) ndarray
-        Errors of the pairs as the fit found them: those given, rescaled, with a floor.
-    used : (N,) ndarray of bool
-        Pairs that were fitted: allowed, valid and not clipped.
-    pv : PVPolynomial or None
-        The exposure's own polynomial with ``refine="pv"``.
-    pv_covariance : (2, n, n) ndarray or None
-        Covariance of its terms, deg^2.
-    reason : str or None
-        Why the exposure was left out; its numbers are then the starting values.
-    statistics : dict
-        Counts and scatter of the pairs used, px.
-    """
-
-    name: str
-    crval: np.ndarray
-    cd: np.ndarray
-    covariance: np.ndarray
-    dx: np.ndarray
-    dy: np.ndarray
-    x_err: np.ndarray
-    y_err: np.ndarray
-    used: np.ndarray
-    pv: "PVPolynomial | None" = None
-    pv_covariance: np.ndarray | None = None
-    reason: str | None = None
-    statistics: dict = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class InstrumentResult:
-    """The instrument and all its exposures.
-
-    Parameters
-    ----------
-    solution : DistortionSolution
-        What the exposures share.
-    exposures : tuple of ExposureFit
-        One per exposure given, in that order.
-    rejected : dict of str
-        Names of the exposures that were left out, and why.
-    table_info : TableInfo or None
-        How the table came about; `None` where there was none to be made.
-    """
-
-    solution: DistortionSolution
-    exposures: tuple
-    rejected: dict
-    table_info: TableInfo | None = None
-
-
-def solve_instrument(
-    exposures,
-    *,
-    image_shape,
-    crpix=None,
-    cd=None,
-    weight=None,
-    degree=3,
-    n_grid=50,
-    lut="auto",
-    refine="attitude",
-    solution=None,
-    update=False,
-    pool_attitudes=True,
-    clip=3.5,
-    table_choice=None,
-    draft=False,
-    detector="",
-    seed=0,
-):
-    r"""Solve for the distortion of one detector and the attitude of each of its exposures.
-
-    Parameters
-    ----------
-    exposures : sequence of Exposure
-        Pairs of every exposure.
-    image_shape : (int, int)
-        Shape ``(ny, nx)`` of the detector.
-    crpix : (2,) array_like, optional
-        Reference point, px, zero based; the centre of the detector, or that of ``solution``, if not
-        given.
-    cd : (2, 2) array_like, optional
-        Nominal matrix CD0 in which the polynomial stands, deg / px; the mean of the solved ones if
-        not given.
-    weight : RadialWeight, optional
-        Radial weight of the polynomial; ``exp-sqrt`` with 0.87 times half the shorter side if not
-        given, and uniform with ``lut="none"``, where no table mends an extrapolation.
-    degree : int, optional
-        Degree of the PV polynomial.  With fewer than three stars per coefficient inside the weight
-        it is lowered.
-    n_grid : int, optional
-        Nodes of the look-up table along each axis.
-    lut : {'auto', 'always', 'none'}, optional
-        Whether there is a table; ``auto`` asks the data.
-    refine : {'attitude', 'pv', 'auto'}, optional
-        What an exposure has of its own: six linear numbers, also a polynomial (the paper's way), or
-        whichever predicts left-out stars better.
-    solution : DistortionSolution, optional
-        Stored instrument: only attitudes are fitted.
-    update : bool, optional
-        Add the residuals of these exposures to those of ``solution`` and make its table anew.
-    pool_attitudes : bool, optional
-        Let five or more exposures tell how much scale, rotation and skew really vary between them,
-        and draw each exposure's towards their mean accordingly.  No effect where the variation
-        exceeds the errors.
-    clip : float, optional
-        Pairs with residuals of more than this many robust standard deviations are left out.
-    table_choice : TableChoice, optional
-        Settings of the table, as found before (``result.table_info.choice``), instead of choosing
-        them again: for pairs of which only a few have changed.
-    draft : bool, optional
-        A table of one kernel on large bins, without uncertainty: for matching again, in a small
-        part of the time.
-    detector : str, optional
-        Name of the detector.
-    seed : int, optional
-        Seed of the division of a single exposure's stars for cross-validation.
-
-    Returns
-    -------
-    InstrumentResult
-        Solution, exposures, and those that were rejected.
-
-    Raises
-    ------
-    FitError
-        If the pairs cannot determine what is asked for; the message names the numbers.
-    ValueError
-        If an option has a wrong value.
-
-    Notes
-    -----
-    The undistorted position is :math:`X'' = CD_0^{-1} PV(CD_0 (x - x_0)) + x_0 - \Delta(x)`, and
-    :math:`CD_e (X'' - x_0)` is the place on the tangent plane about CRVAL of exposure e.
-
-    1. A smooth surface stands in for the instrument; attitudes and surface alternate, outliers are
-       clipped, exposures that do not agree with the others are rejected, and the errors of the
-       pairs are rescaled.
-    2. The polynomial minimises :math:`\sum w(r_i) \Delta_i^2 / \sigma_i^2` over all exposures.
-       Its linear part L, c goes into the attitudes: :math:`CD_e \leftarrow CD_e CD_0^{-1} L CD_0`,
-       :math:`PV \leftarrow L^{-1} (PV - c)`, CRVAL moves, and the reference stars are projected
-       about the new one.
-    3. The table takes what is left (`build_lookup_table`), the attitudes are fitted to all stars,
-       and so on until no exposure moves by 1e-4 px anywhere.
-
-    References
-    ----------
-    WPDC-2P, arXiv:2603.09193, section 3; Bernstein et al. (2017), PASP 129, 074503 (gbdes).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from wpdc_gwcs.instrument import Exposure, solve_instrument
-    >>> from wpdc_gwcs.models import deproject
-    >>> cd, centre, rng = np.array([[-2e-5, 0], [0, 2e-5]]), 1023.5, np.random.default_rng(1)
-    >>> exposures = []
-    >>> for k in range(3):
-    ...     x, y = rng.uniform(0, 2047, (2, 500))
-    ...     u, v = (x - centre) / 1024, (y - centre) / 1024
-    ...     plane = cd @ [x - centre + 3 * u * (u**2 + v**2), y - centre]
-    ...     ra, dec = deproject(*plane, (120.0 + 0.01 * k, 30.0))
-    ...     exposures.append(Exposure(f"e{k}", x, y, ra, dec, crval=(120.0, 30.0), cd=cd))
-    >>> result = solve_instrument(exposures, image_shape=(2048, 2048))
-    >>> result.exposures[2].crval
-    array([120.02, 30. ])
-    """
-    if refine not in ("attitude", "pv", "auto"):
-        raise ValueError(f"refine must be 'attitude', 'pv' or 'auto', got {refine!r}")
-    if lut not in ("auto", "always", "none"):
-        raise ValueError(f"lut must be 'auto', 'always' or 'none', got {lut!r}")
-    image_shape = tuple(int(n) for n in image_shape)
-    exposures = list(exposures)
-    if not exposures:
-        raise FitError("no exposure was given")
-    if solution is not None and tuple(solution.image_shape) != image_shape:
-        raise FitError(
-            f"the stored solution is for a detector of {tuple(solution.image_shape)} px (ny, "
-            "nx), these exposures have "
-            f"{image_shape}"
-        )
-    if update and solution is None:
-        raise ValueError("update needs a stored solution")
-    if solution is not None:
-        crpix, cd = solution.crpix, solution.cd
-    if crpix is None:
-        crpix = 0.5 * (np.array(image_shape[::-1]) - 1.0)
-    crpix = np.array(crpix, dtype=float)
-    if weight is None:
-        name = "uniform" if lut == "none" else "exp-sqrt"
-        weight = RadialWeight.for_shape(image_shape, name)
-
-    pairs = _Pairs(exposures, image_shape, crpix)
-    settings = {
-        "weight": weight.name, "r0": float(weight.r0), "degree": int(degree),
-        "n_grid": int(n_grid), "lut": lut, "refine": refine,
-        "clip": float(clip), "pool_attitudes": bool(pool_attitudes),
-    }  # fmt: skip
-    solver = _Solver(pairs, weight, clip, pool=pool_attitudes, seed=seed)
-    if solution is None:
-        solver.align()
-        solver.solve(cd, degree, n_grid, lut, choice=table_choice, draft=draft)
-    else:
-        solver.attach(solution)
-        if update:
-            solver.update(solution, n_grid)
-    solver.refine(refine)
-    return solver.result(detector, settings, solution)
-
-
-class _Pairs:
-    """All pairs of all exposures in flat arrays, with one slice per exposure."""
-
-    def __init__(self, exposures, image_shape, crpix):
-        self.exposures, self.image_shape, self.crpix = exposures, image_shape, crpix
-        sizes = [np.size(e.x) for e in exposures]
-        edges = np.concatenate([[0], np.cumsum(sizes)])
-        self.slices = [slice(a, b) for a, b in zip(edges[:-1], edges[1:])]
-        n = int(edges[-1])
-        self.x, self.y, self.ra, self.dec = (np.empty(n) for _ in range(4))
-        self.given_error = np.full((2, n), np.nan)
-        self.has_errors = np.zeros(n, bool)
-        self.valid = np.ones(n, bool)
-        for e, s in zip(exposures, self.slices):
-            for name in ("x", "y", "ra", "dec"):
-                value = np.ravel(np.asarray(getattr(e, name), dtype=float))
-                if value.size != s.stop - s.start:
-                    raise ValueError(
-                        f"exposure {e.name}: {name} has {value.size} values, x has "
-                        f"{s.stop - s.start}"
-                    )
-                getattr(self, name)[s] = value
-            if e.x_err is not None and e.y_err is not None:
-                self.given_error[0, s], self.given_error[1, s] = e.x_err, e.y_err
-                self.has_errors[s] = True
-            if e.use is not None:
-                self.valid[s] &= np.asarray(e.use, bool)
-        ny, nx = image_shape
-        finite = np.isfinite(self.x + self.y + self.ra + self.dec)
-        inside = (np.abs(self.x - 0.5 * (nx - 1)) <= 0.5 * nx) & (
-            np.abs(self.y - 0.5 * (ny - 1)) <= 0.5 * ny
-        )
-        self.finite = finite & inside
-        good_error = (np.isfinite(self.given_error) & (self.given_error > 0)).all(0)
-        self.bad_error = self.has_errors & ~good_error
-        allowed = int(self.valid.sum())
-        self.valid &= self.finite & ~self.bad_error
-        if not np.any(self.valid):
-            raise FitError(
-                f"none of {n} pairs can be used: {int((~finite).sum())} have NaN positions, "
-                f"{int((finite & ~inside).sum())} lie off the detector of {nx} x {ny} px, "
-                f"{int(self.bad_error.sum())} "
-                f"have errors that are NaN, infinite or not positive, {n - allowed} are held out"
-            )
-        # Pairs of no known error count as 1 px until the residuals tell.
-        self.sigma = np.where(self.has_errors & good_error, self.given_error, 1.0)
-        self.half = 0.5 * max(image_shape)
-        self.u = np.where(self.finite, (self.x - 0.5 * (nx - 1)) / self.half, 0.0)
-        self.v = np.where(self.finite, (self.y - 0.5 * (ny - 1)) / self.half, 0.0)
-
-    def __len__(self):
-        return len(self.x)
-
-
-class _Solver:
+class Solver:
     """State of the alternation: attitudes, instrument, residuals, errors, what is kept."""
 
     def __init__(self, pairs, weight, clip, *, pool, seed):
@@ -415,9 +74,11 @@ class _Solver:
 
     @property
     def active(self):
+        """Indices of the exposures that are not left out."""
         return [k for k, reason in enumerate(self.reason) if reason is None]
 
     def reject(self, k, reason):
+        """Leave an exposure out; the last one takes the solution with it."""
         name = self.pairs.exposures[k].name
         log.warning("exposure %s left out: %s", name, reason)
         self.reason[k] = reason
@@ -459,7 +120,7 @@ class _Solver:
         for k, reason in enumerate(self.reason):
             if reason is not None:
                 usable[p.slices[k]] = False
-        overall = _scatter(normalised[:, usable])
+        overall = worse_scatter(normalised[:, usable])
         g = int(np.clip(np.sqrt(usable.sum() / 100), 1, 12))
         ny, nx = p.image_shape
         x, y = p.x[usable], p.y[usable]
@@ -468,13 +129,13 @@ class _Solver:
         order = np.argsort(cell, kind="stable")
         scale = np.full(g * g, overall)
         for part in np.split(order, np.flatnonzero(np.diff(cell[order])) + 1):
-            scale[cell[part[0]]] = _scatter(normalised[:, usable][:, part])
+            scale[cell[part[0]]] = worse_scatter(normalised[:, usable][:, part])
         limit = np.zeros(len(p))
         limit[usable] = np.clip(scale[cell], overall, local * overall)
         for k in self.active:
             s = p.slices[k]
             if np.any(usable[s]):
-                self.scale[k] = _scatter(normalised[:, s][:, usable[s]])
+                self.scale[k] = worse_scatter(normalised[:, s][:, usable[s]])
                 limit[s] = np.maximum(limit[s], self.scale[k])
         limit = relax * self.clip * np.maximum(limit, 1e-10)
         kept = usable & (np.max(np.where(usable, normalised, 0.0), axis=0) <= limit)
@@ -487,6 +148,7 @@ class _Solver:
         return z - self.residual
 
     def project_reference(self, k):
+        """Project the stars of one exposure about its CRVAL, px from the reference point."""
         s = self.pairs.slices[k]
         plane = np.array(project(self.pairs.ra[s], self.pairs.dec[s], self.crval[k]))
         return np.linalg.solve(self.cd[k], plane)
@@ -500,7 +162,7 @@ class _Solver:
         """Attitudes, outliers and errors, with a smooth surface for the instrument."""
         p = self.pairs
         n = int(p.valid.sum())
-        _check_coverage(p)
+        check_coverage(p)
         degree = max(
             [
                 d
@@ -562,10 +224,10 @@ class _Solver:
     def _scatter(self, k):
         s = self.pairs.slices[k]
         valid = self.pairs.valid[s]
-        return _scatter(self.residual[:, s][:, valid])
+        return worse_scatter(self.residual[:, s][:, valid])
 
     def rescale_errors(self, n_parameters=None):
-        """Scale and floor of the errors from the residuals; see `_error_model`."""
+        """Scale and floor of the errors from the residuals; see `error_model`."""
         p = self.pairs
         kept = self.kept
         n = int(kept.sum())
@@ -579,7 +241,7 @@ class _Solver:
             group = kept & (p.has_errors == known)
             if not np.any(group):
                 continue
-            scale, floor = _error_model(
+            scale, floor = error_model(
                 self.residual[:, group] * inflation, p.sigma[:, group], fit_floor=known
             )
             everyone = p.has_errors == known
@@ -753,7 +415,7 @@ class _Solver:
         mean = np.mean([self.cd[k] for k in active], axis=0)
         b = np.array([np.linalg.solve(mean, self.cd[k]) - np.eye(2) for k in active])
         covariance = np.array([self.covariance[k] for k in active])
-        posterior, covariance, self.pooled = _pool_linear(b, covariance)
+        posterior, covariance, self.pooled = pool_linear(b, covariance)
         for k, (shift, matrix), c in zip(active, posterior, covariance):
             self.crval[k] = np.array(deproject(*(self.cd[k] @ shift), self.crval[k]))
             self.cd[k] = mean @ (np.eye(2) + matrix)
@@ -787,7 +449,7 @@ class _Solver:
             np.array([0, nx - 1, 0, nx - 1.0]), np.array([0, 0, ny - 1, ny - 1.0])
         )
         for k in self.active:
-            sigma = np.sqrt(_attitude_variance(self.covariance[k], corners).max())
+            sigma = np.sqrt(attitude_variance(self.covariance[k], corners).max())
             if sigma > _MAX_CORNER_SIGMA:
                 n = int(self.kept[self.pairs.slices[k]].sum())
                 self.reject(
@@ -941,11 +603,6 @@ class _Solver:
         )
 
 
-def _scatter(values):
-    """Robust scatter about zero of the worse of two axes."""
-    return max(robust_sigma(v) for v in values)
-
-
 def _blocks(covariance, n):
     return np.array([covariance[:n, :n], covariance[n:, n:]])
 
@@ -967,103 +624,3 @@ def _split_linear(pv):
     both = np.linalg.solve(linear, both)
     both[:, 1:3] = np.eye(2)
     return PVPolynomial.from_coefficients([both[0], both[1][swap]], pv.degree), constant, linear
-
-
-def _check_coverage(pairs):
-    """Refuse stars that say nothing about most of the detector."""
-    x, y = pairs.x[pairs.valid], pairs.y[pairs.valid]
-    ny, nx = pairs.image_shape
-    n = len(x)
-    if n < MIN_STARS_ATTITUDE:
-        raise FitError(f"{n} pairs are too few: at least {MIN_STARS_ATTITUDE} are needed")
-    try:
-        share = ConvexHull(np.stack([x, y], axis=1)).volume / (nx * ny)
-    except QhullError:
-        share = 0.0
-    if share < _MIN_COVERAGE:
-        raise FitError(
-            f"the {n} stars span {share:.1%} of the detector (x {x.min():.0f} to {x.max():.0f} "
-            f"of {nx} px, y "
-            f"{y.min():.0f} to {y.max():.0f} of {ny}): at least {_MIN_COVERAGE:.0%} is needed "
-            "for its distortion"
-        )
-
-
-def _error_model(residual, sigma, *, fit_floor):
-    """Scale s and floor f of the errors: robust variance of the residuals = (s sigma)^2 + f^2.
-
-    Stars are put into groups of equal error; the variances of the groups are fitted, each with its
-    own uncertainty.
-    """
-    order = np.argsort(sigma.ravel())
-    r, e = residual.ravel()[order], sigma.ravel()[order]
-    groups = max(1, min(12, len(r) // 200)) if fit_floor else 1
-    parts = np.array_split(np.arange(len(r)), groups)
-    # Residuals over errors: a group may hold a wide range of errors.
-    e2 = np.array([np.median(e[i] ** 2) for i in parts])
-    v = np.array([robust_sigma(r[i] / e[i]) ** 2 for i in parts]) * e2
-    if groups > 1 and e2.max() > 1.5 * e2.min():
-        scale2, floor2 = nnls(
-            np.stack([e2, np.ones_like(e2)], axis=1) / v[:, None], np.ones_like(v)
-        )[0]
-    else:
-        scale2, floor2 = np.median(v / e2), 0.0
-    if scale2 <= 0:
-        # Errors that say nothing about the residuals.
-        scale2 = 1e-6
-    return float(np.sqrt(scale2)), float(np.sqrt(floor2))
-
-
-def _attitude_variance(covariance, z):
-    """Variances of both axes at positions z about the reference point, ``(2, ...)``."""
-    row = np.stack([np.ones_like(z[0]), z[0], z[1]])
-    return np.array(
-        [np.einsum("i...,ij,j...->...", row, covariance[i : i + 3, i : i + 3], row) for i in (0, 3)]
-    )
-
-
-# Scale, rotation and the two shears of a small linear map (bxx, bxy, byx, byy).
-_MODES = np.array([[1, 0, 0, 1], [0, -1, 1, 0], [1, 0, 0, -1], [0, 1, 1, 0]]) / np.sqrt(2)
-_MODE_NAMES = ("scale", "rotation", "stretch", "shear")
-
-
-def _pool_linear(b, covariance):
-    """Draw the linear parts of exposures towards their mean by as much as their scatter warrants.
-
-    Each mode has its own variance between exposures, estimated as the posterior mean under a flat
-    prior of the standard deviation (restricted likelihood), which is never zero: a few exposures do
-    not prove that nothing varies.
-    """
-    n = len(b)
-    modes = b.reshape(n, 4) @ _MODES.T
-    linear = np.array([1, 2, 4, 5])
-    error = np.einsum("ki,eij,kj->ek", _MODES, covariance[:, linear][:, :, linear], _MODES)
-    variance, mean = np.empty(4), np.empty(4)
-    for m in range(4):
-        typical = np.sqrt(np.median(error[:, m]))
-        spread = np.std(modes[:, m])
-        tau = np.linspace(0.0, 5.0 * max(spread, typical), 400)
-        total = error[:, m] + tau[:, None] ** 2
-        w = 1.0 / total
-        centre = np.sum(w * modes[:, m], axis=1) / w.sum(1)
-        like = -0.5 * (
-            np.log(total).sum(1)
-            + np.log(w.sum(1))
-            + np.sum(w * (modes[:, m] - centre[:, None]) ** 2, axis=1)
-        )
-        like = np.exp(like - like.max())
-        variance[m] = np.sum(like * tau**2) / np.sum(like)
-        w = 1.0 / (error[:, m] + variance[m])
-        mean[m] = np.sum(w * modes[:, m]) / w.sum()
-    prior = _MODES.T @ np.diag(1.0 / variance) @ _MODES
-    posterior, covariances = [], []
-    for k in range(n):
-        precision = np.linalg.inv(covariance[k])
-        right = precision @ np.array([0, *b[k].ravel()[:2], 0, *b[k].ravel()[2:]])
-        right[linear] += prior @ (_MODES.T @ mean)
-        precision[np.ix_(linear, linear)] += prior
-        c = np.linalg.inv(precision)
-        theta = (c @ right).reshape(2, 3)
-        posterior.append((theta[:, 0], theta[:, 1:]))
-        covariances.append(c)
-    return posterior, covariances, dict(zip(_MODE_NAMES, map(float, np.sqrt(variance))))

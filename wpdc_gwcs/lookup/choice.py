@@ -1,0 +1,173 @@
+"""Kernel, degree and smoothing of the table, chosen from the data."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from wpdc_gwcs.exceptions import FitError
+from wpdc_gwcs.lookup.smoother import (
+    MAX_DEGREE,
+    Bins,
+    Spectrum,
+    TableChoice,
+    n_terms,
+    pilot_surface,
+    smooth_surface,
+)
+
+__all__ = ["MIN_STARS_TABLE", "choose_table", "first_choice", "join_bins"]
+
+log = logging.getLogger(__name__)
+
+
+# Kernel, shape parameter and least degree of its polynomial.  The Gaussian of length l has
+# epsilon = 1 / (sqrt(2) l): from three times the detector to a thirteenth of it.
+BROAD_KERNELS = tuple(("gaussian", epsilon, 1) for epsilon in (0.25, 0.5, 1.0, 2.0))
+OPEN_KERNELS = (("thin_plate_spline", 1.0, 1), ("gaussian", 4.0, 1))
+NARROW_KERNELS = tuple(("gaussian", epsilon, 1) for epsilon in (3.0, 5.0, 6.0, 7.5, 9.0))
+
+# Smoothings tried, in units of the largest eigenvalue: from following every bin to all but none.
+_SMOOTHINGS = 10.0 ** np.arange(-10.0, 3.01, 0.5)
+
+# Gain of generalised cross-validation at which kernels of short length are tried.
+_NARROW_GAIN = 0.998
+
+# Candidates that go from generalised cross-validation on to cross-validation over exposures.
+_N_SHORTLIST = 4
+
+# Stars per bin below which bins are joined further for the choice of settings.
+_STARS_PER_BIN = 4
+
+# Fewer stars than this do not carry a table.
+MIN_STARS_TABLE = 60
+
+
+def choose_table(residual_map, *, lut="auto"):
+    """Kernel, degree and smoothing of a look-up table, chosen from the data.
+
+    Parameters
+    ----------
+    residual_map : ResidualMap
+        Residuals of one detector.
+    lut : {'auto', 'always'}, optional
+        Whether the answer may be that no table predicts best.
+
+    Returns
+    -------
+    choice : TableChoice
+        The best settings, for `build_lookup_table`.
+    candidates : tuple of TableChoice
+        All that were compared by cross-validation, best first.
+
+    Raises
+    ------
+    FitError
+        If a table is asked for and the map holds too few stars.
+    """
+    n = residual_map.n_stars
+    if n < MIN_STARS_TABLE:
+        if lut == "always":
+            raise FitError(f"{n} stars cannot carry a look-up table, {MIN_STARS_TABLE} are needed")
+        return TableChoice("none"), ()
+    return _choose(join_bins(residual_map), allow_none=lut == "auto")
+
+
+def join_bins(residual_map):
+    """Larger bins, on which every setting is tried: a smoother on M bins costs M^3."""
+    my, mx = residual_map.shape
+    factors = [k for k in (2, 3, 4) if my % k == 0 and mx % k == 0] or [1]
+    enough = [k for k in factors if residual_map.n_stars * k * k >= _STARS_PER_BIN * my * mx]
+    return residual_map.coarsen(enough[0] if enough else factors[-1])
+
+
+def _choose(coarse, *, allow_none):
+    """Kernel, degree and smoothing by generalised cross-validation, then by groups of exposures."""
+    bins = Bins(coarse)
+    quintic = Spectrum(bins, "quintic", 1.0, 2)
+    pilot = pilot_surface(bins, first_choice(bins, quintic))
+    value = bins.debiased(pilot)
+    narrow = best_of(quintic, value)
+    del quintic
+
+    def try_all(kernels):
+        return [c for k in kernels for c in best_of(Spectrum(bins, *k), value)]
+
+    broad = try_all(BROAD_KERNELS)
+    narrow += try_all(OPEN_KERNELS)
+    # Splines and the medium length take structure of every size: where they are no better than the
+    # broad kernels there is none for the narrow ones.
+    if min(c.score for c in narrow) < _NARROW_GAIN * min(c.score for c in broad):
+        narrow += try_all(NARROW_KERNELS)
+    found = broad + narrow
+    found.sort(key=lambda c: c.score)
+    candidates = [TableChoice("none"), *_distinct(found)]
+    scores = _cross_validate(coarse, candidates, pilot)
+    ranked = sorted(
+        (replace(c, score=float(s)) for c, s in zip(candidates, scores)), key=lambda c: c.score
+    )
+    best = next(c for c in ranked if allow_none or c.kernel != "none")
+    log.info("look-up table: %s", best)
+    return best, tuple(ranked)
+
+
+def first_choice(bins, spectrum=None):
+    """Reasonable settings at once: one kernel, generalised cross-validation."""
+    if spectrum is None:
+        spectrum = Spectrum(bins, "quintic", 1.0, 2)
+    return best_of(spectrum, bins.value)[0]
+
+
+def best_of(spectrum, value):
+    """Best smoothing of each degree, best first."""
+    found = []
+    smoothing = spectrum.eigenvalues.max() * _SMOOTHINGS
+    degrees = [
+        d for d in range(spectrum.least_degree, MAX_DEGREE + 1) if 2 * n_terms(d) <= spectrum.n
+    ]
+    for degree, (score, freedom) in zip(degrees, spectrum.scores(value, smoothing, degrees)):
+        # A smoother that follows nearly every bin has no residuals to be judged by.
+        score = np.where(freedom < 0.9 * spectrum.n, score, np.inf)
+        k = int(np.argmin(score))
+        found.append(
+            TableChoice(
+                spectrum.kernel,
+                degree,
+                float(smoothing[k]),
+                spectrum.epsilon,
+                float(score[k]),
+                float(freedom[k]),
+            )
+        )
+    return sorted(found, key=lambda c: c.score)
+
+
+def _distinct(found):
+    """Keep the best few of different kernels or lengths: neighbours in degree hardly differ."""
+    kept = {}
+    for c in found:
+        kept.setdefault((c.kernel, c.epsilon), c)
+    return list(kept.values())[:_N_SHORTLIST]
+
+
+def _cross_validate(coarse, candidates, pilot):
+    """Mean square normalised residual of left-out groups for each candidate."""
+    folds = coarse.folds
+    total = np.zeros(len(candidates))
+    if len(folds) < 2:
+        # One group alone: generalised cross-validation has the last word, and no table is judged by
+        # the raw means.
+        bins = Bins(coarse)
+        raw = np.sum(bins.value**2 * bins.weight[:, None]) / (2 * len(bins))
+        return np.array([raw if c.kernel == "none" else c.score for c in candidates])
+    n = 0
+    for fold in folds:
+        train, test = Bins(coarse.without(fold)), Bins(coarse.only(fold))
+        value, truth = train.debiased(pilot), test.debiased(pilot)
+        n += 2 * len(test)
+        for k, candidate in enumerate(candidates):
+            predicted = 0.0
+            if candidate.kernel != "none":
+                predicted = smooth_surface(train, value, candidate)(test.u, test.v)
+            total[k] += np.sum((truth - predicted) ** 2 * test.weight[:, None])
+    return total / n

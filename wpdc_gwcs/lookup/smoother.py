@@ -1,0 +1,239 @@
+"""Smooth surfaces through binned residuals.
+
+The numerics behind the table: kernels as in `scipy.interpolate.RBFInterpolator`, spectra for
+cross-validation, pilot surfaces for the curvature within bins.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from scipy.interpolate import RectBivariateSpline
+from scipy.linalg import eigh, lapack, qr
+
+MAX_DEGREE = 7
+
+# Gaussians up to this epsilon are worth a low-rank factor; what it leaves out of a unit diagonal.
+_FULL_RANK_EPSILON = 4.5
+_LOW_RANK_TOLERANCE = 1e-11
+
+# Nodes of the pilot surface along each axis.
+_PILOT_NODES = 51
+
+
+@dataclass(frozen=True)
+class TableChoice:
+    """How a look-up table is interpolated from the bins.
+
+    Parameters
+    ----------
+    kernel : str
+        Kernel of `scipy.interpolate.RBFInterpolator`, or ``none`` for no table.
+    degree : int
+        Degree of the polynomial that the interpolator adds.
+    smoothing : float
+        Smoothing of a bin divided by the variance of its mean (px^2); positions in units of half
+        the longer side.
+    epsilon : float
+        Shape parameter of the kernel in the same unit; 1 for kernels without a scale.
+    score : float
+        Cross-validated mean square of the normalised residuals; NaN if not measured.
+    freedom : float
+        Effective number of parameters per axis.
+    """
+
+    kernel: str
+    degree: int = -1
+    smoothing: float = np.nan
+    epsilon: float = 1.0
+    score: float = np.nan
+    freedom: float = 0.0
+
+
+class Bins:
+    """Occupied bins in normalised coordinates: centroids, means, variances, second moments."""
+
+    def __init__(self, residual_map):
+        total = residual_map.sums.sum(0)
+        occupied = total[0] > 0
+        t = total[:, occupied]
+        ny, nx = residual_map.image_shape
+        # Weighted sums over all groups but one may leave rounding errors, never negative counts.
+        self.half = 0.5 * max(ny, nx)
+        self.middle = np.array([0.5 * (nx - 1), 0.5 * (ny - 1)])
+        offset = t[2:4] / t[1]
+        centroid = offset + residual_map._centers()[:, occupied]
+        self.u, self.v = (centroid - self.middle[:, None]) / self.half
+        self.value = (t[7:9] / t[1]).T
+        self.weight = t[1]
+        # One variance serves both axes; how their noise differs is a property of the detector.
+        ratio = t[12:14].sum(1) / t[1].sum()
+        self.axis_scale = np.sqrt(ratio)
+        self.variance = 1.0 / t[1]
+        mxx = t[4] / t[1] - offset[0] ** 2
+        mxy = t[5] / t[1] - offset[0] * offset[1]
+        myy = t[6] / t[1] - offset[1] ** 2
+        self.moments = np.array([mxx, mxy, myy]) / self.half**2
+        self.count = t[0]
+
+    def __len__(self):
+        return len(self.u)
+
+    def debiased(self, pilot):
+        """Values at the centroids: means less the curvature of the pilot surface over each bin."""
+        mxx, mxy, myy = self.moments[:, :, None]
+        xx, xy, yy = pilot.hessian(self.u, self.v)
+        return self.value - 0.5 * (mxx * xx + 2 * mxy * xy + myy * yy)
+
+
+class Pilot:
+    """Smooth surface on a grid of nodes: values for a draft table, curvature for the bins."""
+
+    def __init__(self, surface, bins):
+        grids = [np.linspace(-1.0, 1.0, _PILOT_NODES) * m for m in (bins.middle + 0.5) / bins.half]
+        u, v = np.meshgrid(*grids)
+        values = surface(u.ravel(), v.ravel()).reshape(*u.shape, 2)
+        self.splines = [RectBivariateSpline(*grids, values[:, :, k].T) for k in range(2)]
+
+    def __call__(self, u, v):
+        """Evaluate the surface, ``(N, 2)``."""
+        return np.stack([f(u, v, grid=False) for f in self.splines], axis=1)
+
+    def hessian(self, u, v):
+        """Second derivatives (xx, xy, yy), each ``(N, 2)``."""
+        return [
+            np.stack([f(u, v, dx=i, dy=2 - i, grid=False) for f in self.splines], axis=1)
+            for i in (2, 1, 0)
+        ]
+
+
+def kernel_matrix(name, epsilon, u, v, u2, v2):
+    """Kernel matrix with the signs and scales of scipy's `RBFInterpolator`."""
+    square = (epsilon * (u[:, None] - u2)) ** 2
+    square += (epsilon * (v[:, None] - v2)) ** 2
+    if name == "gaussian":
+        return np.exp(np.negative(square, out=square), out=square)
+    if name == "quintic":
+        return -(square**2) * np.sqrt(square)
+    # thin plate spline: r^2 log r
+    return 0.5 * square * np.log(np.maximum(square, np.finfo(float).tiny))
+
+
+def polynomials(u, v, degree):
+    """Products of Legendre polynomials up to a total degree, ``(N, p)``, lowest degrees first."""
+    a, b = legvander(u, degree), legvander(v, degree)
+    return np.stack(
+        [a[:, n - j] * b[:, j] for n in range(degree + 1) for j in range(n + 1)], axis=1
+    )
+
+
+def n_terms(degree):
+    """Count the polynomials up to a total degree."""
+    return (degree + 1) * (degree + 2) // 2
+
+
+class Spectrum:
+    """One kernel diagonalised on the bins: cross-validation for all smoothings and degrees.
+
+    With D = diag(sigma), the smoother minimises |D^-1 (d - f)|^2 + s |f|^2 in the kernel's norm.
+    In the space orthogonal to the polynomials of the kernel's least degree, D^-1 K D^-1 = U L U^T;
+    polynomials of higher degree are added by generalised least squares.
+    """
+
+    def __init__(self, bins, kernel, epsilon, least_degree):
+        root = np.sqrt(bins.weight)
+        p = n_terms(least_degree)
+        basis = polynomials(bins.u, bins.v, MAX_DEGREE) * root[:, None]
+        (reflectors, tau), _ = qr(basis[:, :p], mode="raw")
+
+        def rotate(matrix, side="L", transpose="T"):
+            matrix = np.asfortranarray(matrix)
+            work = 64 * max(matrix.shape)
+            return lapack.dormqr(side, transpose, reflectors, tau, matrix, work, overwrite_c=1)[0]
+
+        k = kernel_matrix(kernel, epsilon, bins.u, bins.v, bins.u, bins.v)
+        if kernel == "gaussian" and epsilon < _FULL_RANK_EPSILON:
+            # Long lengths have few modes: K = F F^T of low rank, and the Gram matrix of F is small.
+            factor = rotate(_low_rank(k) * root[:, None])[p:]
+            squares, vectors = eigh(factor.T @ factor, overwrite_a=True, driver="evd")
+            good = squares > 1e-14 * squares[-1]
+            eigenvalues = squares[good]
+            vectors = (factor @ vectors[:, good]) / np.sqrt(eigenvalues)
+        else:
+            k *= root[:, None]
+            k *= root
+            k = rotate(rotate(k), "R", "N")[p:, p:]
+            eigenvalues, vectors = eigh(k, overwrite_a=True, driver="evd", check_finite=False)
+        self.kernel, self.epsilon, self.least_degree = kernel, epsilon, least_degree
+        self.n = len(bins)
+        self.eigenvalues = np.maximum(eigenvalues, 0.0)
+        self._vectors, self._basis, self._root = vectors, basis[:, p:], root
+        self._rotate = lambda matrix: rotate(matrix)[p:]
+
+    def scores(self, value, smoothing, degrees):
+        """Generalised cross-validation and effective parameters, one row per degree."""
+        target = self._rotate(np.hstack([value * self._root[:, None], self._basis]))
+        modes = self._vectors.T @ target
+        # What no mode reaches is all residual.
+        rest = target.T @ target - modes.T @ modes
+        n_rest = len(target) - len(modes)
+        g = smoothing[:, None] / (self.eigenvalues + smoothing[:, None])
+        q = modes.shape[1]
+        # Products of data (first two) and polynomials, once and twice through the residual matrix.
+        products = (modes[:, :, None] * modes[:, None, :]).reshape(-1, q * q)
+        once = (g @ products).reshape(-1, q, q) + rest
+        twice = (g**2 @ products).reshape(-1, q, q) + rest
+        square = twice[:, 0, 0] + twice[:, 1, 1]
+        trace = g.sum(1) + n_rest
+        for degree in degrees:
+            e = slice(2, 2 + n_terms(degree) - n_terms(self.least_degree))
+            inverse = np.linalg.pinv(once[:, e, e], rcond=1e-13, hermitian=True)
+            c = inverse @ once[:, e, :2]
+            twice_c = twice[:, e, e] @ c
+            left = square + np.sum(c * (twice_c - 2 * twice[:, e, :2]), axis=(1, 2))
+            freedom = trace - np.sum(inverse * twice[:, e, e], axis=(1, 2))
+            yield left * self.n / (2 * freedom**2), self.n - freedom
+
+
+def _low_rank(kernel):
+    """Factor F of a positive semi-definite matrix, K = F F^T, by pivoted Cholesky decomposition."""
+    factor, pivots, rank, _ = lapack.dpstrf(kernel, tol=_LOW_RANK_TOLERANCE, lower=1)
+    factor = np.tril(factor)[:, :rank]
+    out = np.empty_like(factor)
+    out[pivots - 1] = factor
+    return out
+
+
+def saddle(bins, choice):
+    """Kernel matrix with smoothing, bordered by the polynomials."""
+    basis = polynomials(bins.u, bins.v, choice.degree)
+    m, p = basis.shape
+    matrix = np.zeros((m + p, m + p))
+    matrix[:m, :m] = kernel_matrix(choice.kernel, choice.epsilon, bins.u, bins.v, bins.u, bins.v)
+    matrix[np.arange(m), np.arange(m)] += choice.smoothing * bins.variance
+    matrix[:m, m:], matrix[m:, :m] = basis, basis.T
+    return matrix
+
+
+def smooth_surface(bins, value, choice):
+    """Smoothed surface through the bins: a function of (u, v) that returns ``(N, 2)``."""
+    matrix = saddle(bins, choice)
+    right = np.zeros((len(matrix), 2))
+    right[: len(bins)] = value
+    solution = np.linalg.solve(matrix, right)
+
+    def surface(u, v):
+        out = polynomials(u, v, choice.degree) @ solution[len(bins) :]
+        return (
+            out
+            + kernel_matrix(choice.kernel, choice.epsilon, u, v, bins.u, bins.v)
+            @ solution[: len(bins)]
+        )
+
+    return surface
+
+
+def pilot_surface(bins, choice):
+    """Smooth surface on the coarse bins whose curvature corrects bin means, in two rounds."""
+    first = Pilot(smooth_surface(bins, bins.value, choice), bins)
+    return Pilot(smooth_surface(bins, bins.debiased(first), choice), bins)
