@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from photutils.detection import DAOStarFinder
 from scipy.special import erf
 
@@ -129,6 +130,42 @@ def test_saturated_edge_and_bad_pixels(field):
     assert flags[2] & FLAG_BAD_PIXEL
     far = (np.hypot(sources["x"] - 170, sources["y"] - 155) > 25) & (sources["x"] > 10)
     assert np.count_nonzero(sources["flags"][far]) == 1
+
+
+def test_saturation_level_is_found_by_its_plateau(field):
+    image, *_ = field
+    assert detect_sources(image).meta["saturation"] is None
+    full = 0.4 * image.max()
+    sources = detect_sources(np.minimum(image, full))
+    assert sources.meta["saturation"] == pytest.approx(full, rel=2e-3)
+    given = detect_sources(np.minimum(image, full), saturation=0.999 * full)
+    assert_array_equal(sources["flags"] & FLAG_SATURATED, given["flags"] & FLAG_SATURATED)
+    assert (sources["flags"] & FLAG_SATURATED).any()
+
+
+def test_dead_pixels_are_masked(field):
+    image, x, y, _ = field
+    image = image.copy()
+    dead = (slice(100, None, 40), slice(100, None, 40))
+    image[dead] = 0
+    background = subtract_background(image)
+    assert background.mask.sum() == image[dead].size
+    assert background.mask[dead].all()
+    # One beside a star: known, not a star of strange shape.
+    k = np.argmin(np.hypot(x - 150, y - 150))
+    image[int(y[k].round()), int(x[k].round()) + 1] = -1000
+    sources = detect_sources(image)
+    row, distance = nearest(sources, x[k : k + 1], y[k : k + 1])
+    assert distance[0] < 0.5
+    assert sources["flags"][row[0]] & FLAG_BAD_PIXEL
+
+
+def test_field_full_of_light(rng):
+    # More pixels above the threshold than sep has room for by default.
+    shape = (400, 5000)
+    image = rng.normal(0, 1, shape)
+    image[40:360, 40:-40] += 30 * (1 + np.cos(np.arange(320) / 2))[:, None]
+    assert len(detect_sources(image)) > 0
 
 
 def test_cosmic_rays_and_galaxies_flagged(field, rng):

@@ -50,6 +50,9 @@ _KERNEL_NOISE = np.sqrt((_KERNEL**2).sum())
 # Values beyond this are blanks of some kind; sums of their squares would overflow float32.
 _HUGE = 1e15
 
+# Pixels this many standard deviations below the background are dead: nothing on the sky is dark.
+_COLD = 10.0
+
 # A neighbour's light at the centre of a source, relative to the source's own, from which the fit
 # of both together is no longer as good as that of a single star.
 _MAX_SHARE = 0.15
@@ -96,7 +99,8 @@ def subtract_background(data, *, mask=None, mesh=64, filter_size=3):
     data : (ny, nx) array_like
         Image of any real type and byte order; not modified.
     mask : (ny, nx) array_like of bool, optional
-        True where a pixel must not be used.  NaN and infinite pixels never are.
+        True where a pixel must not be used.  NaN and infinite pixels never are, nor those far
+        below the background.
     mesh : int, optional
         Size in px of the cells within which the background is estimated.
     filter_size : int, optional
@@ -136,7 +140,10 @@ def subtract_background(data, *, mask=None, mesh=64, filter_size=3):
         raise ValueError(f"the image must be 2-D and at least 8 x 8 px, got shape {data.shape}")
     if mesh < 4 or filter_size < 1:
         raise ValueError(f"mesh must be >= 4 and filter_size >= 1, got {mesh}, {filter_size}")
-    bad = None if data.dtype.kind in "iu" else ~(np.abs(data) < _HUGE)
+    bad = None
+    # Most images are whole, which their extremes tell without an array of their own; NaN fails too.
+    if data.dtype.kind == "f" and not (data.min() > -_HUGE and data.max() < _HUGE):
+        bad = ~(np.abs(data) < _HUGE)
     if mask is not None:
         mask = np.asarray(mask, dtype=bool)
         if mask.shape != data.shape:
@@ -172,6 +179,9 @@ def subtract_background(data, *, mask=None, mesh=64, filter_size=3):
         bad = dead if bad is None else bad | dead
         rms[dead] = noise
     estimate.subfrom(image)
+    if image.min() < -_COLD * rms.min():
+        cold = image < -_COLD * rms
+        bad = cold if bad is None else bad | cold
     if bad is not None:
         image[bad] = 0
     return Background(image, rms, bad, pedestal + float(estimate.globalback), data)
@@ -200,7 +210,8 @@ def detect_sources(
         Electrons per count, for the photon noise in the errors; without it only the background's
         noise counts.
     saturation : float, optional
-        Counts, background included, from which a pixel is saturated.
+        Counts, background included, from which a pixel is saturated.  If not given, it is the
+        plateau of the brightest pixels, if they have one.
     deblend_contrast : float, optional
         Least share of the flux that makes a peak within a larger source a source of its own.
 
@@ -254,6 +265,8 @@ def detect_sources(
     found = _extract(data, threshold, deblend_contrast)
     if len(found) == 0:
         raise DetectionError(f"no source above {threshold:g} sigma on the image")
+    if saturation is None:
+        saturation = _plateau(data)
     fwhm = _typical_fwhm(data, found)
     table = _measure(data, found, fwhm, gain, saturation)
     table.meta.update(fwhm=fwhm, saturation=saturation)
@@ -266,20 +279,46 @@ def detect_sources(
     return table
 
 
+def _plateau(background):
+    """Level at which the brightest pixels are cut off, or None.
+
+    Peaks of stars are the rarer the brighter they are: pixels crowded at the very top have been cut
+    off there.
+    """
+    image = background.image
+    top = float(image.max())
+    if not top > 0:
+        return None
+    # Extremes of the image without background, which varies far less than stars' peaks.
+    high = image > 0.9 * top
+    values = background.data[high if background.mask is None else high & ~background.mask]
+    values = values.astype(float) - background.level
+    limit = 0.999 * values.max(initial=0.0)
+    at_top = np.count_nonzero(values >= limit)
+    if at_top < max(5, 2 * (values.size - at_top)) or top < 50 * np.median(background.rms[::99]):
+        return None
+    return background.level + float(limit)
+
+
 def _extract(background, threshold, deblend_contrast):
     """Extract peaks with sep; returns its structured array."""
     image, rms, mask = background.image, background.rms, background.mask
     # sep's defaults are for small images: it gives up where more pixels or branches are active.
-    sep.set_extract_pixstack(int(np.clip(image.size // 8, 1_000_000, 20_000_000)))
     sep.set_sub_object_limit(8192)
+    threshold = threshold * _KERNEL_NOISE
     parts = []
     # In strips, because sep compares every source with every other one.
     for first in range(0, image.shape[0], _STRIP):
         last = min(first + _STRIP, image.shape[0])
         start, stop = max(first - _OVERLAP, 0), min(last + _OVERLAP, image.shape[0])
+        # Room for all pixels of all sources; no more, because sep writes to all of it every time.
+        active = np.count_nonzero(image[start:stop] > threshold * rms[start:stop])
+        sep.set_extract_pixstack(
+            min(300_000 + 3 * active, 300_000 + (stop - start) * image.shape[1])
+        )
         part = sep.extract(
             image[start:stop],
-            threshold * _KERNEL_NOISE,
+            threshold,
             err=rms[start:stop],
             mask=None if mask is None else mask[start:stop],
             minarea=3,
