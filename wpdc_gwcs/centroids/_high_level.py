@@ -5,6 +5,7 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from wpdc_gwcs.centroids._build import (
     OVERSAMPLING,
@@ -46,6 +47,10 @@ _NEGLIGIBLE = 0.05
 _CHUNK = 10_000
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
+
+# The matrices are small and many: threads of the linear algebra library wait for each other, on a
+# busy machine for several times the work itself.
+_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
 def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0, vary="auto"):
@@ -127,6 +132,7 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
     return None
 
 
+@_one_thread
 def _learn(field, stars, fwhm, gain, vary):
     """Profile from the stars chosen, or None if the fits fail."""
     half = int(np.clip(np.ceil(3 * fwhm), 6, 20)) + 1
@@ -195,7 +201,8 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
     residuals of bright stars:
 
     .. math::
-        \sigma^2 = \sigma_\mathrm{sky}^2 + f \psi / g + (\epsilon f \psi)^2 .
+        \sigma^2 = \sigma_\mathrm{sky}^2 + f \psi / g
+                   + \epsilon^2 f^2 \psi \psi_\mathrm{max} .
 
     The errors are those of the inverse of the normal matrix, times
     :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1.
@@ -222,11 +229,18 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
         raise ValueError(f"passes must be at least 1, got {passes}")
     profile = _from_photutils(epsf)
     fwhm = _typical_fwhm(sources)
-    radius = _fit_radius(fwhm)
     stars = _stars_of(sources)
     flags, is_round = _flags_and_shape(sources)
+    fits = _fit(field, profile, stars, is_round & (flags == 0), fwhm, gain, passes)
+    return _fitted_table(sources, fits, flags, fwhm)
+
+
+@_one_thread
+def _fit(field, profile, stars, quality, fwhm, gain, passes):
+    """Fits of all stars; those of good quality tell the noise."""
+    radius = _fit_radius(fwhm)
     noise = Noise(0.0 if gain is None else 1 / gain, 0.02)
-    candidates = np.flatnonzero(is_round & (flags == 0) & (stars.flux > 0))
+    candidates = np.flatnonzero(quality & (stars.flux > 0))
     candidates = candidates[np.argsort(stars.flux[candidates])[::-1][:_MAX_STARS]]
     fits = fit_stars(field, profile, noise, stars.take(candidates), radius=radius)
     clean = star_like(fits.stars.flux, fits.chi2, fits.valid)
@@ -241,7 +255,7 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
         work = replace(field, image=field.image - model)
         again = fit_stars(work, profile, noise, own.take(rows), radius=radius, own=own.take(rows))
         fits = fits.updated(rows, again)
-    return _fitted_table(sources, fits, flags, fwhm)
+    return fits
 
 
 def _model_of(field, profile, fits, stars, fwhm):
