@@ -80,6 +80,7 @@ def solve_detector(group, settings, *, holdout=None, solution=None, update=False
     if not group:
         raise next(iter(failures.values()))
     pairs = [frame.pairs for frame in group]
+    choice = None
     for attempt in range(_MAX_REMATCH):
         result = solve_instrument(
             [_exposure(*args, holdout) for args in zip(group, pairs, attitudes, strict=True)],
@@ -92,9 +93,12 @@ def solve_detector(group, settings, *, holdout=None, solution=None, update=False
             refine=settings.refine,
             solution=solution,
             update=update,
+            table_choice=choice,
             detector=group[0].detector,
             seed=settings.seed,
         )
+        if result.table_info is not None:
+            choice = result.table_info.choice  # a few other pairs would choose no differently
         if attempt + 1 == _MAX_REMATCH:
             break
         fresh = [
