@@ -252,7 +252,8 @@ def _fit(field, profile, stars, quality, fwhm, gain, passes):
         rows = _disturbed(field, model, profile, own, radius)
         if len(rows) == 0:
             break
-        work = replace(field, image=field.image - model)
+        # In the memory of the model, which is as large as the image.
+        work = replace(field, image=np.subtract(field.image, model, out=model))
         again = fit_stars(work, profile, noise, own.take(rows), radius=radius, own=own.take(rows))
         fits = fits.updated(rows, again)
     return fits
