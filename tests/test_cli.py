@@ -9,10 +9,14 @@ import time
 import asdf
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
+from astropy.stats import mad_std
 from astropy.table import Table
 
-from wpdc_gwcs import read
+from wpdc_gwcs import read, read_catalog, read_frames
+from wpdc_gwcs.catalogs import propagate
 from wpdc_gwcs.cli.app import run
 from wpdc_gwcs.simulation import simulate, write_simulation
 
@@ -350,3 +354,32 @@ def test_parallel_frames_give_the_same_answer(inputs, results, tmp_path):
     for name in ("sim-01", "sim-02"):
         one, two = (read(folder / f"{name}.wcs.asdf") for folder in (results, tmp_path))
         np.testing.assert_allclose(one.wcs(7.0, 9.0), two.wcs(7.0, 9.0), rtol=0, atol=1e-10)
+
+
+def test_real_frame_is_right_at_stars_it_has_not_seen(shared_data, tmp_path):
+    catalog = Table.read(shared_data / "wircam" / "gaia_dr2.fits")
+    held_out = np.random.default_rng(4).uniform(size=len(catalog)) < 0.2
+    catalog[~held_out].write(tmp_path / "catalog.fits")
+    frame = shared_data / "wircam" / "wircam_J_1325839p.fits.fz"
+    out = tmp_path / "out"
+    status = run(
+        ["calibrate", str(frame), "--catalog", str(tmp_path / "catalog.fits"), "--output", str(out),
+         "-q"]
+    )  # fmt: skip
+    assert status == 0
+    stem = out / "wircam_J_1325839p"
+    sources = Table.read(f"{stem}.sources.ecsv")
+    epoch = read_frames(frame)[0].epoch
+    stars = propagate(read_catalog(catalog[held_out]), epoch)
+    with asdf.open(f"{stem}.wcs.asdf", lazy_load=False) as file:
+        found = SkyCoord(*file["wcs"](sources["x"].data, sources["y"].data), unit="deg")
+    true = SkyCoord(stars["ra"], stars["dec"], unit="deg")
+    nearest, separation, _ = true.match_to_catalog_sky(found)
+    near = separation < 0.6 * u.arcsec
+    east, north = (a.to_value(u.mas) for a in true[near].spherical_offsets_to(found[nearest[near]]))
+    assert near.sum() > 500
+    # SExtractor and SCAMP with a cubic leave 27 and 33 mas
+    assert mad_std(east) < 24
+    assert mad_std(north) < 26
+    assert abs(np.median(east)) < 5
+    assert abs(np.median(north)) < 5
