@@ -116,7 +116,7 @@ def calibrate(
     for k, detector in enumerate(detectors):
         progress("solve", k, len(detectors))
         group = [frame for frame in matched if frame.detector == detector]
-        stored = solution.get(detector) if isinstance(solution, Mapping) else solution
+        stored = _stored_of(solution, detector)
         try:
             solved, found, failed = solve_detector(
                 group, settings, holdout=holdout, solution=stored, update=update
@@ -194,10 +194,14 @@ def _match_frames(frames, catalog, solution, settings, jobs, executor, progress)
             raise
 
 
+def _stored_of(solution, detector):
+    """Pick the stored solution of a detector: solutions come alone or by detector."""
+    return solution.get(detector) if isinstance(solution, Mapping) else solution
+
+
 def _stored_for(solution, frame):
-    """Find the stored solution of a frame's detector: solutions come alone or by detector."""
-    if isinstance(solution, Mapping):
-        solution = solution.get(frame.detector)
+    """Find the stored solution of a frame, and refuse one of another detector."""
+    solution = _stored_of(solution, frame.detector)
     if solution is not None and tuple(solution.image_shape) != tuple(frame.image_shape):
         raise FitError(
             f"{frame.source}: the frame has shape (ny, nx) {tuple(frame.image_shape)}, the stored "
