@@ -28,7 +28,8 @@ from gwcs import coordinate_frames as cf
 
 from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, TangentSky
 from wpdc_gwcs.models.blocks import evaluate_blocks, run_blocks
-from wpdc_gwcs.models.mapping import PlaneMap, fit_polynomial
+from wpdc_gwcs.models.mapping import PlaneMap
+from wpdc_gwcs.models.powers import fit_polynomial
 
 __all__ = ["DetectorWCS", "build_wcs", "sky_map", "to_stock_wcs"]
 

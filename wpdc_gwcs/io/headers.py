@@ -467,7 +467,7 @@ def fold_attitude(pv, matrix):
     FileFormatError
         If there are radial terms and A does more than turn, mirror and scale.
     """
-    from wpdc_gwcs.models.mapping import expand_pv
+    from wpdc_gwcs.models.powers import expand_pv
 
     matrix = np.asarray(matrix, float)
     if np.array_equal(matrix, np.eye(2)):

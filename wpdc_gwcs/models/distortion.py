@@ -14,8 +14,9 @@ from astropy.modeling import Model, Parameter
 
 from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.models.lookup_table import LookupTable
-from wpdc_gwcs.models.mapping import PlaneMap, expand_pv
+from wpdc_gwcs.models.mapping import PlaneMap
 from wpdc_gwcs.models.polynomial import PVPolynomial
+from wpdc_gwcs.models.powers import expand_pv
 from wpdc_gwcs.models.tangent import check_invertible
 
 __all__ = ["DetectorToSky", "DistortionCorrection", "DistortionInverse", "SkyToDetector"]

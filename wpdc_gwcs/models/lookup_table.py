@@ -4,7 +4,8 @@ import numpy as np
 from astropy.modeling import Model, Parameter
 
 from wpdc_gwcs.models.blocks import evaluate_blocks
-from wpdc_gwcs.models.mapping import CellGrid, PlaneMap, spline_cells
+from wpdc_gwcs.models.cells import CellGrid, spline_cells
+from wpdc_gwcs.models.mapping import PlaneMap
 
 __all__ = ["LookupTable"]
 

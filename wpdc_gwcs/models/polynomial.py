@@ -6,7 +6,8 @@ from astropy.modeling.parameters import Parameter
 from astropy.units import Quantity
 
 from wpdc_gwcs.models.blocks import evaluate_blocks
-from wpdc_gwcs.models.mapping import PlaneMap, expand_pv
+from wpdc_gwcs.models.mapping import PlaneMap
+from wpdc_gwcs.models.powers import expand_pv
 from wpdc_gwcs.models.terms import pv_terms
 
 __all__ = ["PVInverse", "PVPolynomial"]

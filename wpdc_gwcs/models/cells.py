@@ -1,0 +1,329 @@
+"""Piecewise bicubic maps on a grid of equal cells, summed up by cell."""
+
+import math
+import threading
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+__all__ = ["CellGrid", "spline_cells"]
+
+
+def _horner_columns(columns, s, total, slope=None):
+    """Write the sum of ``columns[..., p] s**p``, and its derivative by s when asked for."""
+    n = columns.shape[-1]
+    np.multiply(columns[..., n - 1], s, out=total)
+    total += columns[..., n - 2]
+    if slope is not None:
+        slope[:] = columns[..., n - 1]
+    for p in range(n - 3, -1, -1):
+        if slope is not None:
+            slope *= s
+            slope += total
+        total *= s
+        total += columns[..., p]
+
+
+# Points whose coefficients are worked on at a time, a compromise: fewer stay closer to the core,
+# more keep threads from waiting for each other.
+_PART_SIZE = 16384
+
+
+def _parts(n):
+    return (slice(start, min(start + _PART_SIZE, n)) for start in range(0, n, _PART_SIZE))
+
+
+class _Scratch(threading.local):
+    """Work space that each thread keeps from block to block.
+
+    Arrays of this size would otherwise be mapped and unmapped by the system for every block, which
+    takes longer than filling them.
+    """
+
+    space = np.empty(0)
+
+    def get(self, shape):
+        size = math.prod(shape)
+        if len(self.space) < size:
+            self.space = np.empty(size)
+        return self.space[:size].reshape(shape)
+
+
+_scratch = _Scratch()
+
+
+class CellGrid:
+    """Equally spaced cells, each with its own polynomial in local coordinates from 0 to 1.
+
+    Parameters
+    ----------
+    x_range, y_range : (float, float)
+        First and last edge.
+    coefficients : (2, n, n, ny, nx) ndarray
+        ``coefficients[k, p, q, j, i]`` multiplies ``s**p t**q`` in output k in cell (j, i).
+    smooth : bool, keyword-only
+        Whether the first derivatives are continuous from cell to cell.
+    """
+
+    def __init__(self, x_range, y_range, coefficients, *, smooth):
+        self.smooth = smooth
+        self.x_low, self.x_high = (float(edge) for edge in x_range)
+        self.y_low, self.y_high = (float(edge) for edge in y_range)
+        self.ny, self.nx = coefficients.shape[-2:]
+        self.x_step = (self.x_high - self.x_low) / self.nx
+        self.y_step = (self.y_high - self.y_low) / self.ny
+        n = coefficients.shape[1]
+        # rows[q, k, cell, p]: the four powers of s side by side, since fetching them 32 bytes at a
+        # time is what costs least, and both outputs in one array, for half as many calls.
+        self.rows = np.ascontiguousarray(coefficients.reshape(2, n, n, -1).transpose(2, 0, 3, 1))
+
+    @property
+    def x_range(self):
+        """First and last edge along x."""
+        return self.x_low, self.x_high
+
+    @property
+    def y_range(self):
+        """First and last edge along y."""
+        return self.y_low, self.y_high
+
+    def clip(self, x, y, margin=0.0):
+        """Move points outside the grid onto its rim, or onto a margin around it, in place.
+
+        Parameters
+        ----------
+        x, y : (N,) ndarray
+            Positions on the grid.
+        margin : float, optional
+            Distance by which points may lie outside.
+        """
+        np.maximum(x, self.x_low - margin, out=x)
+        np.minimum(x, self.x_high + margin, out=x)
+        np.maximum(y, self.y_low - margin, out=y)
+        np.minimum(y, self.y_high + margin, out=y)
+
+    @property
+    def coefficients(self):
+        """The coefficients the grid was made of, ``[k, p, q, j, i]``."""
+        n = len(self.rows)
+        return self.rows.transpose(1, 3, 0, 2).reshape(2, n, n, self.ny, self.nx)
+
+    def locate(self, x, y, margin=0.0):
+        """Return cell numbers, local coordinates and what is outside by more than the margin.
+
+        Parameters
+        ----------
+        x, y : (N,) ndarray
+            Positions on the grid.
+        margin : float, optional
+            Distance by which points may lie outside.
+
+        Notes
+        -----
+        ``outside`` is `None` when every point is inside.
+        """
+        x_low, x_high = self.x_low - margin, self.x_high + margin
+        y_low, y_high = self.y_low - margin, self.y_high + margin
+        outside = None
+        at_edge = margin > 0
+        if len(x):
+            x_most, y_most = x.max(), y.max()
+            # Written so that NaN counts as outside.
+            if not (
+                x.min() >= x_low and x_most <= x_high and y.min() >= y_low and y_most <= y_high
+            ):
+                good = (x >= x_low) & (x <= x_high)
+                good &= (y >= y_low) & (y <= y_high)
+                outside = ~good
+                x = np.where(good, x, self.x_low)
+                y = np.where(good, y, self.y_low)
+                at_edge = True
+            # Within rounding of the division into cells.
+            near = 1.0 - 1e-12
+            at_edge |= x_most >= self.x_low + near * (self.x_high - self.x_low)
+            at_edge |= y_most >= self.y_low + near * (self.y_high - self.y_low)
+        s = x - self.x_low
+        s *= 1.0 / self.x_step
+        t = y - self.y_low
+        t *= 1.0 / self.y_step
+        i, j = np.floor(s), np.floor(t)
+        if at_edge:
+            # The last edge belongs to the last cell, a margin to the outermost ones.
+            np.minimum(i, self.nx - 1, out=i)
+            np.minimum(j, self.ny - 1, out=j)
+        if margin:
+            np.maximum(i, 0, out=i)
+            np.maximum(j, 0, out=j)
+        s -= i
+        t -= j
+        j *= self.nx
+        j += i
+        return j.astype(np.intp), s, t, outside
+
+    def evaluate(self, cell, s, t):
+        """Return both outputs.
+
+        Parameters
+        ----------
+        cell : (N,) ndarray of int
+            Cell numbers, see `locate`.
+        s, t : (N,) ndarray
+            Local coordinates in the cells.
+        """
+        outputs = np.empty((2, len(s)))
+        *lower, highest = self.rows
+        for part in _parts(len(s)):
+            (total, term), wide_t = self._work_space(t[part], 2)
+            highest.take(cell[part], axis=1, out=total, mode="clip")
+            for row in reversed(lower):
+                total *= wide_t
+                row.take(cell[part], axis=1, out=term, mode="clip")
+                total += term
+            _horner_columns(total, s[part], outputs[:, part])
+        return outputs
+
+    def _work_space(self, t, n_arrays):
+        """Return arrays ``[output, point, power of s]``, and t repeated for all powers of s."""
+        n = len(self.rows)
+        space = _scratch.get((2 * n_arrays + 1, len(t), n))
+        wide_t = space[-1]
+        for column in wide_t.T:
+            column[:] = t
+        return space[:-1].reshape(n_arrays, 2, len(t), n), wide_t
+
+    def collapse(self, cell, s):
+        """Return the coefficients ``[k][q]`` of the powers of t that are left when s is given.
+
+        Parameters
+        ----------
+        cell : (N,) ndarray of int
+            Cell numbers, see `locate`.
+        s : (N,) ndarray
+            Local coordinates in the cells.
+        """
+        coefficients = np.empty((2, len(self.rows), len(s)))
+        for q, row in enumerate(self.rows):
+            _horner_columns(row.take(cell, axis=1), s, coefficients[:, q])
+        return coefficients
+
+    def evaluate_jacobian(self, cell, s, t):
+        """Return both outputs and their derivatives, ``(a, b), (a_x, a_y, b_x, b_y)``.
+
+        Parameters
+        ----------
+        cell : (N,) ndarray of int
+            Cell numbers, see `locate`.
+        s, t : (N,) ndarray
+            Local coordinates in the cells.
+        """
+        values, by_s, by_t = np.empty((3, 2, len(s)))
+        *lower, highest = self.rows
+        for part in _parts(len(s)):
+            (total, slope, term), wide_t = self._work_space(t[part], 3)
+            highest.take(cell[part], axis=1, out=total, mode="clip")
+            for step, row in enumerate(reversed(lower)):
+                if step == 0:
+                    slope[:] = total
+                else:
+                    slope *= wide_t
+                    slope += total
+                total *= wide_t
+                row.take(cell[part], axis=1, out=term, mode="clip")
+                total += term
+            _horner_columns(total, s[part], values[:, part], by_s[:, part])
+            _horner_columns(slope, s[part], by_t[:, part])
+        by_s *= 1.0 / self.x_step
+        by_t *= 1.0 / self.y_step
+        return values, (by_s[0], by_t[0], by_s[1], by_t[1])
+
+    def transformed(self, matrix, offset=(0.0, 0.0)):
+        """Return the grid with its outputs (a, b) replaced by ``matrix @ (a, b) + offset``.
+
+        Parameters
+        ----------
+        matrix : (2, 2) array_like
+            Matrix.
+        offset : (2,) array_like, optional
+            Offset.
+        """
+        coefficients = np.einsum("ij,j...->i...", matrix, self.coefficients)
+        coefficients[:, 0, 0] += np.reshape(offset, (2, 1, 1))
+        return CellGrid(self.x_range, self.y_range, coefficients, smooth=self.smooth)
+
+    def curvature(self):
+        """Return a bound M of the second derivatives.
+
+        A step (dx, dy) of Newton's method leaves a residual of at most ``M (dx**2 + dy**2) / 2`` in
+        either output.  Infinite where the first derivatives jump from cell to cell.
+        """
+        if not self.smooth:
+            return np.inf
+        n = len(self.rows)
+        p, q = np.arange(n)[:, np.newaxis, np.newaxis, np.newaxis], np.arange(n)[:, None, None]
+        size = np.abs(self.coefficients)
+        along_x = (size * p * (p - 1)).sum(axis=(1, 2)).max() / self.x_step**2
+        along_y = (size * q * (q - 1)).sum(axis=(1, 2)).max() / self.y_step**2
+        mixed = (size * p * q).sum(axis=(1, 2)).max() / (self.x_step * self.y_step)
+        return max(along_x, along_y) + mixed
+
+    def fold(self, polynomial, origin):
+        """Return a grid of bicubic cells with a polynomial of degree 3 or less added.
+
+        Parameters
+        ----------
+        polynomial : (2, m, m) ndarray
+            In powers of ``x - origin[0]`` and ``y - origin[1]``, m at most 4.
+        origin : (float, float)
+            Reference point.
+
+        Returns
+        -------
+        grid : CellGrid
+            The sum, in cells of 4 x 4 coefficients.
+        """
+        m = polynomial.shape[1]
+        shifts = []
+        for low, step, n, centre in (
+            (self.x_low, self.x_step, self.nx, origin[0]),
+            (self.y_low, self.y_step, self.ny, origin[1]),
+        ):
+            edge = low - centre + step * np.arange(n)
+            shift = np.zeros((n, m, m))
+            for p in range(m):
+                for a in range(p + 1):
+                    shift[:, a, p] = math.comb(p, a) * edge ** (p - a) * step**a
+            shifts.append(shift)
+        local = np.einsum("iap,jbq,kpq->kabji", *shifts, polynomial, optimize=True)
+        n = len(self.rows)
+        total = np.zeros((2, 4, 4, self.ny, self.nx))
+        total[:, :n, :n] += self.coefficients
+        total[:, :m, :m] += local
+        return CellGrid(self.x_range, self.y_range, total, smooth=self.smooth)
+
+
+def spline_cells(x_grid, y_grid, values):
+    """Return the cells of the bicubic spline through values on a grid (not-a-knot ends).
+
+    Parameters
+    ----------
+    x_grid, y_grid : (nx,), (ny,) ndarray
+        Positions of the nodes, equally spaced, four or more.
+    values : (2, ny, nx) ndarray
+        Values at the nodes.
+
+    Returns
+    -------
+    cells : CellGrid
+        The spline.
+    """
+    # A tensor product of one-dimensional splines; the power basis of scipy runs from the highest
+    # power down, in units of the grid, and puts (power, cell) first.
+    along_y = CubicSpline(y_grid, values, axis=1).c  # q, j, k, x
+    both = CubicSpline(x_grid, along_y, axis=3).c  # p, i, q, j, k
+    coefficients = np.moveaxis(both[::-1, :, ::-1], (4, 0, 2, 3, 1), (0, 1, 2, 3, 4))
+    # From units of the grid to the local coordinate of a cell, 0 to 1.
+    x_scale = (x_grid[1] - x_grid[0]) ** np.arange(4)
+    y_scale = (y_grid[1] - y_grid[0]) ** np.arange(4)
+    scale = x_scale[:, np.newaxis] * y_scale
+    coefficients = coefficients * scale[..., np.newaxis, np.newaxis]
+    return CellGrid(x_grid[[0, -1]], y_grid[[0, -1]], coefficients, smooth=True)

@@ -1,0 +1,121 @@
+"""Polynomials of the plane in powers of both coordinates: expanded, fitted, summed up."""
+
+import math
+
+import numpy as np
+
+from wpdc_gwcs.models.terms import pv_terms
+
+__all__ = ["derivative", "expand_pv", "fit_polynomial", "horner"]
+
+
+def _linear_power(coefficients, power):
+    """Coefficients of ``(c0 a + c1 b)**power`` by the power of ``a``, lowest first."""
+    c0, c1 = coefficients
+    return np.array([math.comb(power, i) * c0**i * c1 ** (power - i) for i in range(power + 1)])
+
+
+def expand_pv(coefficients, degree, radial, matrix):
+    """Expand a PV polynomial of ``matrix @ (u, v)`` into powers of u and v.
+
+    Parameters
+    ----------
+    coefficients : (2, n_terms) ndarray
+        In the order of `~wpdc_gwcs.models.pv_terms`.
+    degree : int
+        Degree of the polynomial.
+    radial : bool
+        Whether radial terms are among the coefficients.
+    matrix : (2, 2) ndarray
+        Linear map from (u, v) to (xi, eta).
+
+    Returns
+    -------
+    polynomial : (2, degree + 1, degree + 1) ndarray
+        ``polynomial[k, p, q]`` multiplies ``u**p v**q`` in output k.
+    radial_polynomial : (2, degree + 1) ndarray or None
+        ``radial_polynomial[k, s]`` multiplies ``r**s`` in output k; `None` without radial terms.
+    """
+    terms = pv_terms(degree, radial)
+    n = degree + 1
+    polynomial = np.zeros((2, n, n))
+    in_radius = np.zeros((2, n))
+    powers = [[_linear_power(row, p) for p in range(n)] for row in matrix]
+    for axis in (0, 1):
+        own_powers, other_powers = powers[axis], powers[1 - axis]
+        for value, own, other, radius in zip(
+            coefficients[axis], terms.own, terms.other, terms.radius, strict=True
+        ):
+            if value == 0.0:
+                continue
+            if radius:
+                in_radius[axis, radius] += value
+                continue
+            total = own + other
+            homogeneous = np.convolve(own_powers[own], other_powers[other])
+            polynomial[axis, np.arange(total + 1), total - np.arange(total + 1)] += (
+                value * homogeneous
+            )
+    return polynomial, (in_radius if in_radius.any() else None)
+
+
+def fit_polynomial(points, values, degree):
+    """Fit a map of the plane by polynomials.
+
+    Parameters
+    ----------
+    points, values : (2, N) array_like
+        Points and their images.
+    degree : int
+        Total degree.
+
+    Returns
+    -------
+    polynomial : (2, degree + 1, degree + 1) ndarray
+        ``polynomial[k, p, q]`` multiplies ``u**p v**q`` in output k, (u, v) being the point minus
+        origin.
+    origin : (float, float)
+        Centre of the points.
+    """
+    origin = tuple(0.5 * (point.min() + point.max()) for point in points)
+    # Scaled for the solution, not for its use: floating-point powers lose nothing.
+    scale = 0.5 * max(np.ptp(point) for point in points)
+    u, v = ((point - centre) / scale for point, centre in zip(points, origin, strict=True))
+    powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p)]
+    matrix = np.stack([u**p * v**q for p, q in powers], axis=1)
+    fit = np.linalg.lstsq(matrix, np.stack(values, axis=1), rcond=None)[0]
+    polynomial = np.zeros((2, degree + 1, degree + 1))
+    for (p, q), pair in zip(powers, fit, strict=True):
+        polynomial[:, p, q] = pair / scale ** (p + q)
+    return polynomial, origin
+
+
+def horner(coefficients, a, b):
+    """Sum of ``coefficients[p, q] a**p b**q`` over ``p + q < n`` by Horner's rule."""
+    n = len(coefficients)
+    total = None
+    for p in range(n - 1, -1, -1):
+        row = coefficients[p]
+        q = n - 1 - p
+        if q == 0:
+            total = np.full(a.shape, row[0])
+            continue
+        inner = row[q] * b
+        inner += row[q - 1]
+        for k in range(q - 2, -1, -1):
+            inner *= b
+            inner += row[k]
+        total *= a
+        total += inner
+    return total
+
+
+def derivative(coefficients, axis):
+    """Coefficients of the derivative by u (axis 0) or v (axis 1)."""
+    n = len(coefficients)
+    if n == 1:
+        return np.zeros((1, 1))
+    factors = np.arange(1.0, n)
+    if axis == 0:
+        return coefficients[1:, : n - 1] * factors[:, np.newaxis]
+    return coefficients[: n - 1, 1:] * factors
