@@ -32,7 +32,9 @@ _LEAST_ANCHORS = 8
 # Neighbours that must coincide for a hypothesis.
 _LEAST_COUNT = 3
 # Differences held in memory at a time.
-_CHUNK = 6_000_000
+_CHUNK = 2_000_000
+# Boxes per difference up to which they are counted in an array of all boxes.
+_DENSE = 20
 N_NEIGHBOURS = 12
 MAX_NEIGHBOURS = 160
 
@@ -239,39 +241,9 @@ def _coincidences(log_s, angle_s, log_r, angle_r, max_log_scale, max_rotation):
     d_log = log_r[pair, found % n_reference] - log_s[pair, ks]
     near = np.abs(d_log) <= max_log_scale
     pair, d_log, d_angle = pair[near], d_log[near], d_angle[near]
-    in_range = np.bincount(pair, minlength=n)
-    surprise = np.zeros(n)
-    center, half, expected = np.zeros((2, n)), np.zeros(n), np.zeros(n)
-    for width in BOX_WIDTHS:
-        if width > 2 * max(max_log_scale, max_rotation):
-            continue
-        share = min(1.0, width**2 / (4 * max_log_scale * max_rotation))
-        n_angle = int(2 * max_rotation / width) + 3
-        per_pair = n_angle * (int(2 * max_log_scale / width) + 3)
-        # short integers sort twice as fast
-        kind = np.int32 if n * per_pair < 2**31 else np.int64
-        first = pair.astype(kind) * kind(per_pair)
-        # boxes on four staggered grids: none straddles an edge on all of them
-        for edge in ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5)):
-            box = ((d_log + max_log_scale) / width + edge[0]).astype(kind) * kind(n_angle)
-            box += ((d_angle + max_rotation) / width + edge[1]).astype(kind)
-            box += first
-            box.sort()
-            start = np.flatnonzero(np.diff(box, prepend=kind(-1)))
-            count = np.diff(start, append=len(box))
-            full = count >= _LEAST_COUNT
-            count, box = count[full], box[start[full]]
-            owner, place = box // per_pair, box % per_pair
-            chance = np.maximum((in_range[owner] - count) * share, 1e-3)
-            now = -np.log10(np.maximum(gammainc(count, chance), 1e-300))
-            better = np.flatnonzero(now > surprise[owner])
-            better = better[np.lexsort((now[better], owner[better]))]
-            # the last of each owner is its best
-            better = better[np.diff(owner[better], append=-1) != 0]
-            owner = owner[better]
-            surprise[owner], expected[owner], half[owner] = now[better], chance[better], width / 2
-            center[0, owner] = (place[better] // n_angle + 0.5 - edge[0]) * width - max_log_scale
-            center[1, owner] = (place[better] % n_angle + 0.5 - edge[1]) * width - max_rotation
+    surprise, half, expected, center = _fullest_boxes(
+        pair, d_log, d_angle, n, max_log_scale, max_rotation
+    )
     inside = np.abs(d_log - center[0, pair]) <= half[pair]
     inside &= np.abs(d_angle - center[1, pair]) <= half[pair]
     pair, d_log, d_angle = pair[inside], d_log[inside], d_angle[inside]
@@ -280,6 +252,64 @@ def _coincidences(log_s, angle_s, log_r, angle_r, max_log_scale, max_rotation):
         np.bincount(pair, weights=d, minlength=n) / np.maximum(count, 1) for d in (d_log, d_angle)
     ]
     return *mean, count, expected, surprise, 2 * half
+
+
+def _fullest_boxes(pair, d_log, d_angle, n, max_log_scale, max_rotation):
+    """Find the most surprising box of every pattern: its surprise, half width, chance, centre.
+
+    Boxes of every width stand on four staggered grids, so that none straddles an edge on all of
+    them.  What shares a box of one width with too few others does so in every box of half the
+    width, since that lies in one of the wider ones: wide boxes are counted first, and narrow ones
+    only where they may be full.
+    """
+    in_range = np.bincount(pair, minlength=n)
+    surprise, half, expected = np.zeros(n), np.zeros(n), np.zeros(n)
+    center = np.zeros((2, n))
+    for width in BOX_WIDTHS[::-1]:
+        if width > 2 * max(max_log_scale, max_rotation):
+            continue
+        share = min(1.0, width**2 / (4 * max_log_scale * max_rotation))
+        n_angle = int(2 * max_rotation / width) + 3
+        per_pair = n_angle * (int(2 * max_log_scale / width) + 3)
+        promising = np.zeros(len(pair), bool)
+        # a narrow box that is no less surprising says more about scale and rotation
+        best = np.where(surprise > 0, np.nextafter(surprise, 0), 0.0)
+        for edge in ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5)):
+            box = ((d_log + max_log_scale) / width + edge[0]).astype(np.int64) * n_angle
+            box += ((d_angle + max_rotation) / width + edge[1]).astype(np.int64)
+            box += pair * per_pair
+            full, count, member = _count_in_boxes(box, n * per_pair)
+            promising |= member
+            owner, place = full // per_pair, full % per_pair
+            chance = np.maximum((in_range[owner] - count) * share, 1e-3)
+            now = -np.log10(np.maximum(gammainc(count, chance), 1e-300))
+            better = np.flatnonzero(now > best[owner])
+            better = better[np.lexsort((now[better], owner[better]))]
+            # the last of each owner is its best
+            better = better[np.diff(owner[better], append=-1) != 0]
+            owner = owner[better]
+            best[owner] = surprise[owner] = now[better]
+            expected[owner], half[owner] = chance[better], width / 2
+            center[0, owner] = (place[better] // n_angle + 0.5 - edge[0]) * width - max_log_scale
+            center[1, owner] = (place[better] % n_angle + 0.5 - edge[1]) * width - max_rotation
+        pair, d_log, d_angle = pair[promising], d_log[promising], d_angle[promising]
+    return surprise, half, expected, center
+
+
+def _count_in_boxes(box, n_boxes):
+    """Boxes with enough members, their counts, and which members are in such a box."""
+    if n_boxes > _DENSE * len(box):
+        # few members in many boxes: keep only the boxes that have any
+        order = np.argsort(box, kind="stable")
+        start = np.flatnonzero(np.diff(box[order], prepend=-1))
+        count = np.diff(start, append=len(box))
+        member = np.empty(len(box), bool)
+        member[order] = np.repeat(count >= _LEAST_COUNT, count)
+        keep = count >= _LEAST_COUNT
+        return box[order[start[keep]]], count[keep], member
+    count = np.bincount(box, minlength=n_boxes)
+    full = np.flatnonzero(count >= _LEAST_COUNT)
+    return full, count[full], count[box] >= _LEAST_COUNT
 
 
 def select_coherent(
