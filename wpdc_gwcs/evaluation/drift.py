@@ -1,0 +1,387 @@
+"""Whether a stored solution still holds; where it does not, and by how much.
+
+::
+
+    residuals --means in cells--> most significant cell, whole detector --> verdict
+        '--less the linear part of what has not changed--> cells that have changed, by how much
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import QTable, Table
+from scipy.ndimage import median
+from scipy.stats import chi2
+
+from wpdc_gwcs.evaluation.residuals import robust_scatter
+
+__all__ = ["Drift", "detect_drift"]
+
+# Cells along each side of the detector in which a drift is looked for, and stars that a cell needs.
+_GRIDS = (2, 4, 8, 16)
+_MIN_STARS = 8
+
+# Cells along each side for the test of the whole detector.
+_WHOLE_GRID = 8
+
+# The uncertainty of a table is itself an estimate: taken this much larger, so that a false alarm is
+# no more frequent than stated.
+_TABLE_MARGIN = 1.5
+
+# Stars per cell in the grid on which the linear part of what has not changed is found.
+_LINEAR_STARS = 200
+
+# Chi-square (two axes) of a cell from which it no longer counts for it: 1 in 1000.
+_CHANGED_CHI2 = 13.8
+
+# Smallest share of the cells that must be unchanged for their linear part to be the attitudes'.
+_UNCHANGED_SHARE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Whether a stored solution still holds, where it does not, and by how much.
+
+    Parameters
+    ----------
+    drifted : bool
+        Whether the residuals contradict the solution.
+    p_value : float
+        Probability of residuals as unlikely as these if nothing has changed.
+    false_alarm : float
+        Limit on the p-value: how often an unchanged instrument is reported as changed.
+    amplitude : float
+        Root mean square of the change over the cells that have changed, both axes together, px; 0
+        without drift.
+    area : float
+        Share of the detector's stars that are in these cells.
+    n_stars : int
+        Stars tested.
+    cells : `~astropy.table.QTable`
+        Cells in which the residuals were averaged, most significant first: ``x_min``, ``x_max``,
+        ``y_min``, ``y_max`` in px, ``n``, means ``dx``, ``dy`` and their ``sigma_dx``,
+        ``sigma_dy`` in px, ``p_value`` of each cell alone, and ``changed``.  If there is a drift,
+        the linear part of what has not changed is taken off, and stars in a small cell that has
+        changed no longer count in the larger ones about it.
+    """
+
+    drifted: bool
+    p_value: float
+    false_alarm: float
+    amplitude: float
+    area: float
+    n_stars: int
+    cells: QTable
+
+
+def detect_drift(solution, matches, *, false_alarm=0.01):
+    """Test whether a stored solution still describes the detector.
+
+    Parameters
+    ----------
+    solution : DistortionSolution
+        The stored solution.
+    matches : `~astropy.table.Table` or iterable of them
+        Match tables of frames that were calibrated with this solution, attitude only: columns
+        ``x``, ``y``, ``dx``, ``dy``, ``x_err``, ``y_err`` in px.
+    false_alarm : float, optional
+        Accepted probability of reporting a change where there is none.
+
+    Returns
+    -------
+    Drift
+        The verdict, its p-value and the cells behind it.
+
+    Raises
+    ------
+    ValueError
+        If ``false_alarm`` is not between 0 and 1, or no cell has enough stars for a test.
+
+    Notes
+    -----
+    1. The residuals are averaged in 2 x 2 to 16 x 16 cells.  Their variance is that of the stars'
+       errors, scaled to the observed scatter and, with several frames, to the scatter of the means
+       from frame to frame (turbulence is common to the stars of one cell), and that of the
+       solution.
+    2. The most significant cell, its probability multiplied by the number of cells (Bonferroni,
+       which holds whatever the correlation between cells), and the chi-square of the whole
+       detector, with the correlation of the table's errors, have half of the false alarms each.
+    3. The attitudes of the frames have taken a linear part of a change.  It is what the largest
+       set of cells says that agree on one: a robust fit from many starting points.  It is taken
+       off, and cells are tested again, small ones first.
+
+    A change that is linear over the whole detector is not seen: it is in the attitudes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs import DistortionSolution, PVPolynomial, detect_drift
+    >>> cd = np.diag([-2e-5, 2e-5])
+    >>> solution = DistortionSolution(
+    ...     "d", (1000, 1000), np.array([499.5, 499.5]), cd, np.array([10.0, 20.0]), PVPolynomial()
+    ... )
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 999, (2, 4000))
+    >>> dx, dy = rng.normal(0, 0.05, (2, 4000))
+    >>> matches = Table({"x": x, "y": y, "dx": dx, "dy": dy, "x_err": dx * 0 + 0.05,
+    ...                  "y_err": dx * 0 + 0.05})
+    >>> detect_drift(solution, matches).drifted
+    False
+    >>> matches["dx"][(x < 500) & (y < 500)] += 0.03
+    >>> drift = detect_drift(solution, matches)
+    >>> drift.drifted, round(drift.amplitude, 2), round(drift.area, 2)
+    (True, 0.03, 0.25)
+    """
+    if not 0 < false_alarm < 1:
+        raise ValueError(f"false_alarm must be between 0 and 1, got {false_alarm}")
+    if isinstance(matches, Table) or not isinstance(matches, Iterable):
+        matches = [matches]
+    stars = _Stars(solution, [_columns_of(table) for table in matches])
+    grids = {n: stars.average(n) for n in _GRIDS}
+    p_values = np.concatenate([g.p_value for g in grids.values()])
+    if len(p_values) == 0:
+        raise ValueError(
+            f"no part of the detector has {_MIN_STARS} stars: {stars.x.size} stars are too few "
+            "to test"
+        )
+    p_value = float(min(1.0, 2 * min(p_values.min() * len(p_values), _whole(solution, grids))))
+    drifted = bool(p_value < false_alarm)
+    limit = false_alarm / len(p_values)
+    changed = {n: np.zeros(len(g.index), bool) for n, g in grids.items()}
+    amplitude = area = 0.0
+    if drifted:
+        grids, changed, gone = _localize(stars, grids, limit)
+        area = float(gone.mean())
+        amplitude = _amplitude(grids, changed)
+    cells = QTable(
+        np.concatenate([_rows(solution, n, grids[n], changed[n]) for n in grids]), copy=False
+    )
+    cells.sort("p_value")
+    for name in ("x_min", "x_max", "y_min", "y_max", "dx", "dy", "sigma_dx", "sigma_dy"):
+        cells[name].unit = "pix"
+    return Drift(drifted, p_value, false_alarm, amplitude, area, stars.x.size, cells)
+
+
+def _columns_of(table):
+    """Take position, residual and error of the valid stars of a frame, errors as the scatter is."""
+    names = ("x", "y", "dx", "dy", "x_err", "y_err")
+    columns = np.array([np.asarray(table[name], dtype=float) for name in names])
+    columns = columns[:, np.isfinite(columns).all(axis=0) & (columns[4:] > 0).all(axis=0)]
+    for axis in range(2):
+        scale = robust_scatter(columns[2 + axis] / columns[4 + axis])
+        columns[4 + axis] *= max(1.0, scale) if np.isfinite(scale) else 1.0
+    return columns
+
+
+class _Stars:
+    """Residuals of all frames, and their means in the cells of any grid."""
+
+    def __init__(self, solution, frames):
+        columns = np.concatenate(frames, axis=1)
+        self.solution = solution
+        self.x, self.y, self.residual, self.sigma = (
+            columns[0],
+            columns[1],
+            columns[2:4],
+            columns[4:],
+        )
+        self.frame = np.repeat(np.arange(len(frames)), [f.shape[1] for f in frames])
+        self.n_frames = len(frames)
+
+    def cell(self, n_grid):
+        """Index of the cell of every star."""
+        ny, nx = self.solution.image_shape
+        ix = np.clip(((self.x + 0.5) * n_grid / nx).astype(int), 0, n_grid - 1)
+        iy = np.clip(((self.y + 0.5) * n_grid / ny).astype(int), 0, n_grid - 1)
+        return iy * n_grid + ix
+
+    def average(self, n_grid, *, residual=None, use=None, inflation=None):
+        """Means in n_grid x n_grid cells: all residuals, or other ones of some of the stars."""
+        residual = self.residual if residual is None else residual
+        cell, m = self.cell(n_grid), n_grid**2
+        rows = np.arange(len(cell)) if use is None else np.flatnonzero(use)
+        # A wrong pair must not speak for its cell; a change that is large must.
+        center = np.array([median(r[rows], cell[rows], np.arange(m)) for r in residual])
+        near = np.abs(residual[:, rows] - center[:, cell[rows]]) < 5 * self.sigma[:, rows]
+        rows = rows[near.all(axis=0)]
+        cell, residual, weight = cell[rows], residual[:, rows], self.sigma[:, rows] ** -2
+        count = np.bincount(cell, minlength=m)
+        full = np.flatnonzero(count >= _MIN_STARS)
+        total = np.array([np.bincount(cell, w, minlength=m) for w in weight])
+        safe = np.where(total > 0, total, 1.0)
+        mean = (
+            np.array([np.bincount(cell, r * w, minlength=m) for r, w in zip(residual, weight)])
+            / safe
+        )
+        if inflation is None:
+            inflation = self._inflation(cell, rows, residual, weight, mean, m)
+        x_size, y_size = (n / n_grid for n in self.solution.image_shape[::-1])
+        known = self.solution.covariance(
+            (full % n_grid + 0.5) * x_size - 0.5, (full // n_grid + 0.5) * y_size - 0.5
+        )
+        known = np.array([np.nan_to_num(known[i, i]) for i in range(2)]) * _TABLE_MARGIN**2
+        return _Cells(
+            full, count[full], mean[:, full], inflation / total[:, full], known, inflation
+        )
+
+    def _inflation(self, cell, rows, residual, weight, mean, m):
+        """How much more the means of frames scatter than the errors of their stars, at least 1.
+
+        The attitude of a frame takes three of the means of each axis.
+        """
+        if self.n_frames < 2 or m <= 4:
+            return 1.0
+        key = self.frame[rows] * m + cell
+        size = self.n_frames * m
+        excess = freedom = 0.0
+        for r, w, mean_of in zip(residual, weight, mean):
+            total = np.bincount(key, w, minlength=size).reshape(self.n_frames, m)
+            first = np.bincount(key, w * r, minlength=size).reshape(self.n_frames, m)
+            there = total > 0
+            own = first / np.where(there, total, 1.0)
+            excess += np.sum(np.where(there, total * (own - mean_of) ** 2, 0.0))
+            freedom += there.sum() - there.any(axis=0).sum() - 3 * (self.n_frames - 1)
+        return max(1.0, excess / freedom) if freedom > 0 else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Means of the cells of a grid that have enough stars, and their variances (2, M)."""
+
+    index: np.ndarray
+    n: np.ndarray
+    mean: np.ndarray
+    noise: np.ndarray
+    known: np.ndarray
+    inflation: float
+
+    @property
+    def variance(self):
+        return self.noise + self.known
+
+    @property
+    def p_value(self):
+        return np.exp(-0.5 * np.sum(self.mean**2 / self.variance, axis=0))
+
+    def place(self, n_grid):
+        """Centres of the cells from -1 to 1, as columns (1, u, v)."""
+        u, v = (2 * (i + 0.5) / n_grid - 1 for i in (self.index % n_grid, self.index // n_grid))
+        return np.stack([np.ones_like(u), u, v], axis=1)
+
+
+def _whole(solution, grids):
+    """Probability of the chi-square of all cells together.
+
+    The errors of the table are common to neighbouring cells: they have no more independent values
+    than the table has parameters, and the chi-square scatters the more.
+    """
+    cells = grids[_WHOLE_GRID]
+    n = len(cells.index)
+    if n <= 6:
+        return 1.0
+    value = np.sum(cells.mean**2 / cells.variance)
+    freedom = solution.statistics.get("table", {}).get("freedom") or 6.0
+    common = max(1.0, n / max(freedom, 1.0))
+    share = cells.known / cells.variance
+    # Chi-square scaled to the mean and the variance of the sum (Satterthwaite).
+    mean, variance = (
+        2.0 * n,
+        2.0 * np.sum((1 - share) ** 2 + common * share**2 + 2 * share * (1 - share)),
+    )
+    return float(chi2.sf(2 * value * mean / variance, 2 * mean**2 / variance))
+
+
+def _localize(stars, grids, limit):
+    """Cells that have changed, without the linear part that the attitudes have taken.
+
+    Returns the means of all grids, which cells have changed, and the stars in these.
+    """
+    linear = _unchanged_linear(grids)
+    ny, nx = stars.solution.image_shape
+    place = [np.ones_like(stars.x), (2 * stars.x + 1) / nx - 1, (2 * stars.y + 1) / ny - 1]
+    residual = stars.residual - linear @ place
+    gone = np.zeros(stars.x.size, bool)
+    found, changed = {}, {}
+    for n_grid in sorted(grids, reverse=True):
+        cells = stars.average(
+            n_grid, residual=residual, use=~gone, inflation=grids[n_grid].inflation
+        )
+        found[n_grid], changed[n_grid] = cells, cells.p_value < limit
+        gone |= np.isin(stars.cell(n_grid), cells.index[changed[n_grid]])
+    if not gone.any():
+        # Significant together, none by itself: what stands out before is all there is to show.
+        found = grids
+        changed = {n: g.p_value == min(c.p_value.min(initial=1) for c in grids.values())
+                   for n, g in grids.items()}  # fmt: skip
+        for n_grid, mask in changed.items():
+            gone |= np.isin(stars.cell(n_grid), grids[n_grid].index[mask])
+    return found, changed, gone
+
+
+def _unchanged_linear(grids):
+    """Linear part (2, 3) of the cells that have not changed: the most that agree on one."""
+    # A cell must show a change by itself.
+    good = [n for n, g in grids.items() if len(g.index) >= 9 and np.median(g.n) >= _LINEAR_STARS]
+    if not good:
+        return np.zeros((2, 3))
+    n_grid = max(good)
+    cells = grids[n_grid]
+    rows = cells.place(n_grid)
+    best, best_loss = np.zeros((2, 3)), np.inf
+    for kept in _starts(rows[:, 1], rows[:, 2]):
+        for _ in range(30):
+            if kept.sum() < 9:
+                break
+            fit = np.array(
+                [
+                    np.linalg.lstsq(rows[kept] / s[kept, None], m[kept] / s[kept], rcond=None)[0]
+                    for m, s in zip(cells.mean, np.sqrt(cells.variance))
+                ]
+            )
+            chi = np.sum((cells.mean - fit @ rows.T) ** 2 / cells.variance, axis=0)
+            before, kept = kept, chi < _CHANGED_CHI2
+            loss = np.minimum(chi, _CHANGED_CHI2).sum()
+            if loss < best_loss and kept.mean() >= _UNCHANGED_SHARE:
+                best, best_loss = fit, loss
+            if np.array_equal(before, kept):
+                break
+    return best
+
+
+def _starts(u, v):
+    """Parts of the detector to begin with: all, without a quarter of any kind, halves, the ring."""
+    yield np.ones(u.size, bool)
+    for a, b in ((u, v), (-v, u), (-u, -v), (v, -u)):
+        yield ~((a > 0) & (b > 0))
+        yield a < 0.5
+        yield a < 0
+        yield (a < 0) | (a > 0.5)
+    yield np.maximum(np.abs(u), np.abs(v)) > 0.5
+    yield np.maximum(np.abs(u), np.abs(v)) < 0.75
+    yield np.abs(u) > 0.3
+    yield np.abs(v) > 0.3
+
+
+def _amplitude(grids, changed):
+    """Root mean square of the change over the changed cells, less what noise adds."""
+    n = np.concatenate([g.n[changed[k]] for k, g in grids.items()])
+    square = np.concatenate(
+        [np.sum(g.mean**2 - g.noise, axis=0)[changed[k]] for k, g in grids.items()]
+    )
+    return float(np.sqrt(max(np.sum(n * square) / np.sum(n), 0.0)))
+
+
+def _rows(solution, n_grid, cells, changed):
+    """Rows of the table of cells."""
+    ny, nx = solution.image_shape
+    x_min = (cells.index % n_grid) * (nx / n_grid) - 0.5
+    y_min = (cells.index // n_grid) * (ny / n_grid) - 0.5
+    return np.rec.fromarrays(
+        [
+            x_min, x_min + nx / n_grid, y_min, y_min + ny / n_grid, cells.n, *cells.mean,
+            *np.sqrt(cells.variance), cells.p_value, changed,
+        ],
+        names="x_min,x_max,y_min,y_max,n,dx,dy,sigma_dx,sigma_dy,p_value,changed",
+    )  # fmt: skip

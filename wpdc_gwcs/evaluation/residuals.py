@@ -1,0 +1,199 @@
+"""Statistics of residuals: clipped moments, robust scatter, d80, maps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.stats import SigmaClip
+
+__all__ = ["ResidualStatistics", "binned_residuals", "d80", "evaluate", "robust_scatter"]
+
+
+@dataclass(frozen=True)
+class ResidualStatistics:
+    """Statistics of the residuals of a set of matched stars.
+
+    Parameters
+    ----------
+    n : int
+        Number of stars with finite residuals.
+    n_clipped : int
+        Stars left after the 3-sigma clipping, both axes together.
+    mean_dx, mean_dy : float
+        Means after clipping, px.
+    sigma_dx, sigma_dy : float
+        Standard deviations after clipping, px.
+    scatter_dx, scatter_dy : float
+        Robust scatter, 1.4826 times the median absolute deviation, of all stars, px.
+    d80_dx, d80_dy : float
+        Width between the 20 % and 80 % levels of the cumulative distribution, px.
+    rms : float
+        Root mean square of the total (two-axis) residual after clipping, px.
+    """
+
+    n: int
+    n_clipped: int
+    mean_dx: float
+    sigma_dx: float
+    mean_dy: float
+    sigma_dy: float
+    scatter_dx: float
+    scatter_dy: float
+    d80_dx: float
+    d80_dy: float
+    rms: float
+
+
+def robust_scatter(values):
+    """Scatter of values that outliers do not move: 1.4826 times the median absolute deviation.
+
+    Parameters
+    ----------
+    values : (N,) array_like
+        Values in any unit; NaN are ignored.
+
+    Returns
+    -------
+    float
+        Scatter in the unit of the values, the standard deviation if they are normal; NaN if empty.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.evaluation import robust_scatter
+    >>> round(robust_scatter([1.0, 2.0, 3.0, 1000.0]), 4)
+    1.4826
+    """
+    values = np.asarray(values, dtype=float)
+    values = values[np.isfinite(values)]
+    if values.size == 0:
+        return np.nan
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
+def d80(values):
+    """Width between the 20 % and 80 % levels of the cumulative distribution.
+
+    Parameters
+    ----------
+    values : (N,) array_like
+        Residuals of one axis in px; NaN are ignored.
+
+    Returns
+    -------
+    float
+        Width in px, the measure by which the paper compares weighting functions; NaN if empty.
+
+    References
+    ----------
+    WPDC-2P, arXiv:2603.09193, section 3.2.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.evaluation import d80
+    >>> round(d80(np.linspace(0.0, 1.0, 101)), 3)
+    0.6
+    """
+    values = np.asarray(values, dtype=float)
+    values = values[np.isfinite(values)]
+    if values.size == 0:
+        return np.nan
+    low, high = np.percentile(values, [20, 80])
+    return float(high - low)
+
+
+def evaluate(dx, dy, *, sigma=3.0):
+    """Statistics of the residuals of matched stars.
+
+    Parameters
+    ----------
+    dx, dy : (N,) array_like
+        Residuals X' - X_ref and Y' - Y_ref in px.
+    sigma : float, optional
+        Clipping limit of the moments in standard deviations; the default is the paper's 3.
+
+    Returns
+    -------
+    ResidualStatistics
+        All NaN, with ``n = 0``, where there are no stars.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import evaluate
+    >>> rng = np.random.default_rng(1)
+    >>> s = evaluate(rng.normal(0.0, 0.05, 5000), rng.normal(0.01, 0.05, 5000))
+    >>> s.n, round(s.sigma_dx, 2), round(s.mean_dy, 2)
+    (5000, 0.05, 0.01)
+    """
+    if not sigma > 0:
+        raise ValueError(f"sigma must be positive, got {sigma}")
+    dx, dy = np.broadcast_arrays(np.asarray(dx, dtype=float), np.asarray(dy, dtype=float))
+    finite = np.isfinite(dx) & np.isfinite(dy)
+    dx, dy = dx[finite], dy[finite]
+    if dx.size == 0:
+        return ResidualStatistics(0, 0, *[np.nan] * 9)
+    clip = SigmaClip(sigma=sigma, maxiters=None)
+    keep = ~(np.ma.getmaskarray(clip(dx)) | np.ma.getmaskarray(clip(dy)))
+    x, y = dx[keep], dy[keep]
+    return ResidualStatistics(
+        n=int(dx.size),
+        n_clipped=int(keep.sum()),
+        mean_dx=float(x.mean()),
+        sigma_dx=float(x.std()),
+        mean_dy=float(y.mean()),
+        sigma_dy=float(y.std()),
+        scatter_dx=robust_scatter(dx),
+        scatter_dy=robust_scatter(dy),
+        d80_dx=d80(dx),
+        d80_dy=d80(dy),
+        rms=float(np.sqrt(np.mean(x**2 + y**2))),
+    )
+
+
+def binned_residuals(x, y, dx, dy, *, image_shape, n_bins=20):
+    """Mean residuals in the cells of a grid over the detector.
+
+    Parameters
+    ----------
+    x, y : (N,) array_like
+        Pixel coordinates, zero based.
+    dx, dy : (N,) array_like
+        Residuals in px.
+    image_shape : (int, int)
+        Shape of the detector, ``(ny, nx)``.
+    n_bins : int, optional
+        Cells along each axis; the paper shows 20 x 20.
+
+    Returns
+    -------
+    mean_dx, mean_dy : (n_bins, n_bins) `numpy.ndarray`
+        Means in px, indexed ``[iy, ix]``, NaN where a cell has no star.
+    count : (n_bins, n_bins) `numpy.ndarray` of int
+        Stars in each cell.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.evaluation import binned_residuals
+    >>> mean_dx, mean_dy, count = binned_residuals(
+    ...     [10, 12, 90], [10, 10, 90], [0.1, 0.3, 0.5], [0, 0, 0], image_shape=(100, 100), n_bins=2
+    ... )
+    >>> mean_dx.round(3).tolist()
+    [[0.2, nan], [nan, 0.5]]
+    """
+    if n_bins < 1:
+        raise ValueError(f"n_bins must be at least 1, got {n_bins}")
+    ny, nx = image_shape
+    x, y, dx, dy = (np.asarray(a, dtype=float) for a in (x, y, dx, dy))
+    good = np.isfinite(x) & np.isfinite(y) & np.isfinite(dx) & np.isfinite(dy)
+    x, y, dx, dy = x[good], y[good], dx[good], dy[good]
+    ix = np.clip(((x + 0.5) * n_bins / nx).astype(int), 0, n_bins - 1)
+    iy = np.clip(((y + 0.5) * n_bins / ny).astype(int), 0, n_bins - 1)
+    cell = iy * n_bins + ix
+    count = np.bincount(cell, minlength=n_bins**2)
+    safe = np.where(count, count, 1)
+
+    def mean(values):
+        total = np.bincount(cell, weights=values, minlength=n_bins**2)
+        return np.where(count, total / safe, np.nan).reshape(n_bins, n_bins)
+
+    return mean(dx), mean(dy), count.reshape(n_bins, n_bins)
