@@ -386,16 +386,21 @@ def test_head_for_galsim(tmp_path):
 
 
 def test_head_for_swarp(tmp_path):
-    """SWarp resamples an image of its own x (or y): every value says where it was taken from."""
+    """SWarp resamples an image of its own x (or y): every value says where it was taken from.
+
+    It works in single precision: the ramp starts anew every few pixels.  And it inverts PV by a
+    fit, which is why the distortion is small here: at 5 px the fit is off by 6e-6 px at the corners.
+    """
+    period = 4
     swarp = next((p for name in ("SWarp", "swarp") if (p := shutil.which(name))), None)
     if swarp is None:
         pytest.skip("SWarp is not installed")
-    calibration = make_calibration(n=512, table=None, amplitude=5.0)
+    calibration = make_calibration(n=512, table=None, amplitude=2.0)
     ny, nx = calibration.solution.image_shape
     deviations = []
     for axis in (0, 1):
         ramp = np.broadcast_to(np.arange(nx), (ny, nx)) if axis == 0 else np.arange(ny)[:, None]
-        pixels = np.broadcast_to(ramp, (ny, nx)).astype(np.float32) + 1.0
+        pixels = np.broadcast_to(ramp % period, (ny, nx)).astype(np.float32)
         fits.writeto(tmp_path / "a.fits", pixels, overwrite=True)
         write(calibration, tmp_path / "a.head", overwrite=True)
         options = {
@@ -423,12 +428,13 @@ def test_head_for_swarp(tmp_path):
             warnings.simplefilter("ignore")
             out = WCS(fits.getheader(tmp_path / "coadd.fits"))
         v, u = np.nonzero(weights > 0.99 * weights.max())
-        expected = calibration.wcs.invert(*out.all_pix2world(u, v, 0))[axis] + 1.0
-        inside = (expected > 20) & (expected < 490)
+        place = np.array(calibration.wcs.invert(*out.all_pix2world(u, v, 0)))
+        expected = place[axis] % period
+        # Not between the last value of the ramp and the first, nor at the edge of the image.
+        inside = (place > 20).all(axis=0) & (place < 490).all(axis=0) & (expected < period - 1)
         assert inside.sum() > 1e5
         deviations.append(np.abs(values[v, u] - expected)[inside].max())
-    # Values of some 500 in single precision.
-    assert max(deviations) < 1e-3
+    assert max(deviations) < 1e-6
 
 
 def test_sip(tmp_path):
@@ -610,126 +616,6 @@ def test_nothing_is_left_of_a_write_that_fails(tmp_path, calibration, monkeypatc
         write(calibration, tmp_path / "a.out", format=format, overwrite=True)
     assert os.listdir(tmp_path) == ["a.out"]
     assert (tmp_path / "a.out").read_text() == "precious"
-
-
-# --- real headers -------------------------------------------------------------------------------
-
-
-def plain_headers(path):
-    """Headers of a conformance file as astropy gets them: not through this package."""
-    data = path.read_bytes()
-    if data[:9] == b"SIMPLE  =" and path.suffix in (".fits", ".wcs"):
-        with fits.open(path) as hdus:
-            return [h.header.copy() for h in hdus if "CTYPE1" in h.header]
-    lines = data.decode("latin-1").splitlines()
-    if len(lines) < 3:
-        lines = [lines[0][i : i + 80] for i in range(0, len(lines[0]), 80)]
-    keep = [
-        line[:80].encode("ascii", "replace").decode()
-        for line in lines
-        if line[8:9] == "=" and not line.startswith("#")
-    ]
-    return [fits.Header([fits.Card.fromstring(line) for line in keep])]
-
-
-CONFORMANCE = [
-    "galsim_fits_registry/tpv.fits",
-    "galsim_fits_registry/tanpv.fits",
-    "galsim_fits_registry/tpv_odd.fits",
-    "galsim_fits_registry/tanflip.fits",
-    "galsim_fits_registry/DECam_00154912_12_header.fits",
-    "galsim_fits_registry/scamp.head",
-    "scamp_heads/example_scamp.head",
-    "scamp_heads/example_externcat_scamp.head",
-    "scamp_heads/example_externcat_scamp_tpv.head",
-    "scamp_heads/wircam_scamp1.6.2_RA---TAN_PV.head.txt",
-    "sip_tpv/PTF_r_chip01_tpv.txt",
-    "astropy/tpvonly.hdr",
-    "wcslib_keyrec/TPV3.keyrec",
-    "wcslib_keyrec/TPV5.keyrec",
-    "wcslib_keyrec/TPV7.keyrec",
-]
-
-
-def compare_with_astropy(header, ours):
-    header = header.copy()
-    if "CD1_1" not in header and "TPV" in header["CTYPE1"]:
-        # astropy.wcs drops TPV distortions where the linear part is a bare CDELT.
-        for i in (1, 2):
-            header[f"CD{i}_{i}"] = header.pop(f"CDELT{i}")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        theirs = WCS(header)
-    nx, ny = (max(int(header.get(f"NAXIS{i}", 0)), 2048) for i in (1, 2))
-    x, y = (v.ravel() for v in np.meshgrid(np.linspace(0, nx, 21), np.linspace(0, ny, 21)))
-    world = theirs.all_pix2world(np.column_stack([x, y]), 0)
-    expected = world[:, theirs.wcs.lng], world[:, theirs.wcs.lat]
-    got = ours(x, y, with_bounding_box=False)
-    center = [header["CRVAL1"], header["CRVAL2"]]
-    if theirs.wcs.lng == 1:
-        center = center[::-1]
-    difference = np.subtract(project(*got, center), project(*expected, center))
-    linear = theirs.pixel_scale_matrix
-    if theirs.wcs.lng == 1:
-        linear = linear[::-1]
-    return np.hypot(*np.linalg.solve(linear, difference)).max()
-
-
-@pytest.mark.parametrize("name", CONFORMANCE)
-def test_conformance_headers(shared_data, name):
-    path = shared_data / "wcs_headers" / "conformance" / name
-    (header,) = plain_headers(path)
-    assert compare_with_astropy(header, read_wcs(path)) < 1e-6
-
-
-def test_survey_headers(shared_data):
-    folder = shared_data / "wcs_headers" / "legacysurvey"
-    count = 0
-    for path in sorted([*folder.glob("90prime/*.fits"), *folder.glob("*.wcs")]):
-        with fits.open(path) as hdus:
-            numbers = [i for i, h in enumerate(hdus) if "CTYPE1" in h.header]
-            headers = [hdus[i].header.copy() for i in numbers]
-        for number, header in zip(numbers[-3:], headers[-3:], strict=True):
-            assert compare_with_astropy(header, read_wcs(f"{path}[{number}]")) < 1e-6, path
-            count += 1
-    assert count > 30
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "astropy/sip.fits",
-        "astropy/siponly.hdr",
-        "astropy/too_many_pv.hdr",
-        "galsim_fits_registry/sipsample.fits",
-        "sip_tpv/IRAC_3.6um_sip.txt",
-        "wcslib_keyrec/SIP.keyrec",
-    ],
-)
-def test_sip_headers(shared_data, name):
-    path = shared_data / "wcs_headers" / "conformance" / name
-    ours = read_wcs(path)
-    (header,) = plain_headers(path)
-    for key in [k for k in header if k.startswith("PV")]:
-        del header[key]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        theirs = WCS(header, naxis=2)
-    x, y = np.meshgrid(np.linspace(0, 2000, 11), np.linspace(0, 2000, 11))
-    np.testing.assert_allclose(
-        ours.pixel_to_world_values(x, y), theirs.all_pix2world(x, y, 0), rtol=1e-12
-    )
-
-
-def test_lookup_tables_of_astropy(shared_data):
-    """SIP, CPDIS and D2IM together, from a compressed file."""
-    path = shared_data / "wcs_headers" / "conformance" / "astropy" / "dist_lookup.fits.gz"
-    ours = read_wcs(path)
-    with warnings.catch_warnings(), fits.open(path) as hdus:
-        warnings.simplefilter("ignore")
-        theirs = WCS(hdus[1].header, hdus)
-        expected = theirs.all_pix2world([10.0, 50.0], [20.0, 70.0], 0)
-    np.testing.assert_allclose(ours.pixel_to_world_values([10.0, 50.0], [20.0, 70.0]), expected)
 
 
 def test_older_files_keep_opening():

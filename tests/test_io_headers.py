@@ -144,7 +144,7 @@ def test_lonpole(lonpole, crval2):
     assert deviation(header) < 1e-6
 
 
-@pytest.mark.parametrize("form", ["PC", "CROTA", "plain", "arcsec"])
+@pytest.mark.parametrize("form", ["PC", "PC of the draft", "CROTA", "plain", "arcsec"])
 def test_forms_of_the_linear_part(form):
     header = tpv_header(code="TAN")
     for key in [*header["PV*"], *header["CD*"]]:
@@ -152,6 +152,8 @@ def test_forms_of_the_linear_part(form):
     header["CDELT1"], header["CDELT2"] = -8e-5, 7.9e-5
     if form == "PC":
         header.update({"PC1_1": 0.99, "PC1_2": 0.1, "PC2_1": -0.1})  # PC2_2 defaults to 1
+    elif form == "PC of the draft":
+        header.update({"PC001001": -0.99, "PC001002": 0.1, "PC002001": -0.1, "PC002002": 1.0})
     elif form == "CROTA":
         header["CROTA2"] = 33.0
     elif form == "arcsec":
@@ -159,6 +161,26 @@ def test_forms_of_the_linear_part(form):
             header[f"CUNIT{axis}"] = "arcsec"
             header[f"CDELT{axis}"] *= 3600
             header[f"CRVAL{axis}"] *= 3600
+    assert deviation(header) < 1e-6
+
+
+def test_rotation_is_that_of_the_latitude_axis():
+    header = fits.Header(
+        {
+            "CTYPE1": "DEC--TAN", "CTYPE2": "RA---TAN", "CRVAL1": -30.0, "CRVAL2": 150.0,
+            "CRPIX1": 1000.0, "CRPIX2": 900.0, "CDELT1": 8e-5, "CDELT2": -7e-5,
+            "CROTA1": 33.0, "CROTA2": 5.0,
+        }
+    )  # fmt: skip
+    assert deviation(header) < 1e-6
+
+
+def test_sip_that_ctype_does_not_tell():
+    """astropy applies it, and so do we."""
+    header = tpv_header(code="TAN")
+    for key in list(header["PV*"]):
+        del header[key]
+    header.update({"A_ORDER": 2, "B_ORDER": 2, "A_2_0": 1e-5, "B_0_2": -2e-5})
     assert deviation(header) < 1e-6
 
 

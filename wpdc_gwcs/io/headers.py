@@ -41,6 +41,8 @@ __all__ = [
 
 _PV_CARD = re.compile(r"PV([12])_(\d+)")
 _TABLE_CARD = re.compile(r"(CPDIS|CQDIS|D2IMDIS)[12]")
+# SIP whatever CTYPE says, and the plate solution of the Digitized Sky Survey.
+_DISTORTION_CARD = re.compile(r"[AB]_ORDER|AMDX1")
 _CARD_START = re.compile(r"[A-Z0-9_-]{1,8} *= *\S")
 _LONGITUDES = ("RA", "GLON", "ELON")
 _LATITUDES = ("DEC", "GLAT", "ELAT")
@@ -381,7 +383,7 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
     Parameters
     ----------
     header : `~astropy.io.fits.Header`
-        Header with CD, PC + CDELT or CDELT + CROTA2; axes in either order.
+        Header with CD, PC + CDELT or CDELT + CROTA; axes in either order.
     name : str, optional
         What messages call the header.
     error : type, optional
@@ -392,8 +394,8 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
     Returns
     -------
     tan : TanHeader or None
-        `None` for celestial headers of other kinds (SIP, look-up tables, other projections,
-        galactic axes), which `parse_wcs` reads.
+        `None` for celestial headers of other kinds (SIP, look-up tables, plate solutions, other
+        projections, galactic axes), which `parse_wcs` reads.
 
     Raises
     ------
@@ -409,6 +411,8 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
     """
     order, codes = _celestial_axes(header, name, error)
     if codes[0] not in ("TAN", "TPV") or header_text(header, "CTYPE1")[:2] not in ("RA", "DE"):
+        return None
+    if any(_DISTORTION_CARD.fullmatch(key) for key in header):
         return None
     if not ignore_tables and any(_TABLE_CARD.fullmatch(key) for key in header):
         return None
@@ -429,7 +433,7 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
     scale = [_degrees(header, axis, name, error) for axis in (1, 2)]
     crval = np.array([number(f"CRVAL{axis}") * scale[axis - 1] for axis in (1, 2)])[order]
     crpix = np.array([number("CRPIX1"), number("CRPIX2")]) - 1.0
-    cd = (_linear(header, number, name, error) * np.array(scale)[:, None])[order]
+    cd = (_linear(header, order, number, name, error) * np.array(scale)[:, None])[order]
     spread = np.abs(cd).max()
     if not spread > 0 or abs(np.linalg.det(cd)) < 1e-10 * spread**2:
         rows = ", ".join(f"{v:.6g}" for v in cd.ravel())
@@ -529,7 +533,7 @@ def _degrees(header, axis, name, error):
         raise error(f"{name}: CUNIT{axis} must be an angle, got {text!r}") from problem
 
 
-def _linear(header, number, name, error):
+def _linear(header, order, number, name, error):
     """Linear map of pixels to intermediate world coordinates in the units of the header."""
     keys = np.array([["CD1_1", "CD1_2"], ["CD2_1", "CD2_2"]])
     present = np.array([[k in header for k in row] for row in keys])
@@ -541,15 +545,20 @@ def _linear(header, number, name, error):
                 raise error(f"{name}: card {gone} is missing")
         return np.array([[number(k, required=False, default=0.0) for k in row] for row in keys])
     cdelt = np.array([number("CDELT1"), number("CDELT2")])
-    if any(f"PC{i}_{j}" in header for i in (1, 2) for j in (1, 2)):
-        pc = [
-            [number(f"PC{i}_{j}", required=False, default=float(i == j)) for j in (1, 2)]
-            for i in (1, 2)
-        ]
-        return cdelt[:, None] * np.array(pc)
-    rho = np.radians(number("CROTA2", required=False, default=0.0))
-    c, s = np.cos(rho), np.sin(rho)
-    return np.array([[cdelt[0] * c, -cdelt[1] * s], [cdelt[0] * s, cdelt[1] * c]])
+    # PC001001 is how a draft of the standard spelled PC1_1; wcslib still reads it.
+    for key in ("PC{}_{}", "PC00{}00{}"):
+        if any(key.format(i, j) in header for i in (1, 2) for j in (1, 2)):
+            pc = [
+                [number(key.format(i, j), required=False, default=float(i == j)) for j in (1, 2)]
+                for i in (1, 2)
+            ]
+            return cdelt[:, None] * np.array(pc)
+    lon, lat = order
+    rho = np.radians(number(f"CROTA{lat + 1}", required=False, default=0.0))
+    linear = np.diag(cdelt * np.cos(rho))
+    linear[lon, lat] = -cdelt[lat] * np.sin(rho)
+    linear[lat, lon] = cdelt[lon] * np.sin(rho)
+    return linear
 
 
 def _read_pv(numbers, order, number, name, error):
@@ -672,19 +681,38 @@ def _to_icrs(wcs, name, error):
     if frame.name == "icrs" or (frame.name == "fk5" and abs(equinox - 2000.0) < 1e-3):
         return wcs
     lon, lat = wcs.wcs.crval
-    # Of a zenithal projection, the reference point is the pole of the native sphere.
-    points = SkyCoord([lon, lon], [lat, min(lat + 1e-3, 90.0)], unit="deg", frame=frame).icrs
-    if not min(lat + 1e-3, 90.0) > lat:
-        raise error(f"{name}: {frame.name} frame cannot be turned to ICRS at its own pole")
-    angle = points[0].position_angle(points[1]).deg
-    ctype = [
+    if wcs.wcs.theta0 == 90.0:
+        # Of a zenithal projection, the reference point is the pole of the native sphere.
+        north = min(lat + 1e-3, 90.0)
+        if not north > lat:
+            raise error(f"{name}: {frame.name} frame cannot be turned to ICRS at its own pole")
+        points = SkyCoord([lon, lon], [lat, north], unit="deg", frame=frame).icrs
+        lonpole = wcs.wcs.lonpole + points[0].position_angle(points[1]).deg
+        latpole = math.nan
+        reference = points[0]
+    else:
+        reference = SkyCoord(lon, lat, unit="deg", frame=frame).icrs
+        pole = SkyCoord(0.0, 90.0, unit="deg", frame="icrs").transform_to(frame).spherical
+        native = wcs.wcs.s2p([[pole.lon.deg, pole.lat.deg]], 0)
+        lonpole, latpole = float(native["phi"][0]), float(native["theta"][0])
+    before = wcs.deepcopy()
+    wcs.wcs.crval = [reference.ra.deg, reference.dec.deg]
+    wcs.wcs.lonpole, wcs.wcs.latpole = lonpole, latpole
+    wcs.wcs.ctype = [
         re.sub("^.LON-", "RA---", wcs.wcs.ctype[0]),
         re.sub("^.LAT-", "DEC--", wcs.wcs.ctype[1]),
     ]
-    wcs.wcs.crval = [points[0].ra.deg, points[0].dec.deg]
-    wcs.wcs.lonpole = wcs.wcs.lonpole + angle
-    wcs.wcs.latpole = math.nan
-    wcs.wcs.ctype = ctype
     wcs.wcs.radesys, wcs.wcs.equinox = "ICRS", math.nan
     wcs.wcs.set()
+    _check_turned(before, wcs, frame, name, error)
     return wcs
+
+
+def _check_turned(before, after, frame, name, error):
+    """Compare a WCS turned to ICRS with what it was, around its reference point."""
+    x, y = before.wcs.crpix[:, np.newaxis] - 1.0 + 50.0 * np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]])
+    lon, lat = before.wcs_pix2world(x, y, 0)
+    ra, dec = after.wcs_pix2world(x, y, 0)
+    expected = SkyCoord(lon, lat, unit="deg", frame=frame).icrs
+    if not np.all(expected.separation(SkyCoord(ra, dec, unit="deg")).deg < 1e-7):
+        raise error(f"{name}: {frame.name} axes of this projection cannot be turned to ICRS")
