@@ -127,7 +127,8 @@ def main():
     options = parser.parse_args()
     find_lab()
     print(f"{'case':13s} {'stored':>6s} {'tested':>6s}  {'change':9s} {'trials':>6s} "
-          f"{'alarms':>7s} {'area':>5s} {'false':>6s} {'found':>8s} {'true':>8s} {'s':>5s}")  # fmt: skip
+          f"{'alarms':>7s} {'area':>5s} {'false':>6s} "
+          f"{'found':>8s} {'true':>8s} {'s':>5s}")  # fmt: skip
     for case in options.cases:
         for stored in options.stored:
             cameras = [Camera(case, seed, stored) for seed in options.seeds]

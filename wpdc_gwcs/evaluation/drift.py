@@ -35,6 +35,9 @@ _LINEAR_STARS = 200
 # Chi-square (two axes) of a cell from which it no longer counts for it: 1 in 1000.
 _CHANGED_CHI2 = 13.8
 
+# Probability of the differences within a cell from which it has changed as a whole.
+_UNIFORM = 1e-3
+
 # Smallest share of the cells that must be unchanged for their linear part to be the attitudes'.
 _UNCHANGED_SHARE = 0.5
 
@@ -62,8 +65,8 @@ class Drift:
         Cells in which the residuals were averaged, most significant first: ``x_min``, ``x_max``,
         ``y_min``, ``y_max`` in px, ``n``, means ``dx``, ``dy`` and their ``sigma_dx``,
         ``sigma_dy`` in px, ``p_value`` of each cell alone, and ``changed``.  If there is a drift,
-        the linear part of what has not changed is taken off, and stars in a small cell that has
-        changed no longer count in the larger ones about it.
+        the linear part of what has not changed is taken off, and the stars of a cell that has
+        changed no longer count in those about it.
     """
 
     drifted: bool
@@ -109,7 +112,8 @@ def detect_drift(solution, matches, *, false_alarm=0.01):
        detector, with the correlation of the table's errors, have half of the false alarms each.
     3. The attitudes of the frames have taken a linear part of a change.  It is what the largest
        set of cells says that agree on one: a robust fit from many starting points.  It is taken
-       off, and cells are tested again, small ones first.
+       off, and cells are tested again: large ones that have changed as a whole, then small ones,
+       then what these leave of larger ones.
 
     A change that is linear over the whole detector is not seen: it is in the attitudes.
 
@@ -148,16 +152,13 @@ def detect_drift(solution, matches, *, false_alarm=0.01):
         )
     p_value = float(min(1.0, 2 * min(p_values.min() * len(p_values), _whole(solution, grids))))
     drifted = bool(p_value < false_alarm)
-    limit = false_alarm / len(p_values)
-    changed = {n: np.zeros(len(g.index), bool) for n, g in grids.items()}
+    parts = [(n, g, np.zeros(len(g.index), bool)) for n, g in grids.items()]
     amplitude = area = 0.0
     if drifted:
-        grids, changed, gone = _localize(stars, grids, limit)
+        parts, gone = _localize(stars, grids, false_alarm / len(p_values))
         area = float(gone.mean())
-        amplitude = _amplitude(grids, changed)
-    cells = QTable(
-        np.concatenate([_rows(solution, n, grids[n], changed[n]) for n in grids]), copy=False
-    )
+        amplitude = _amplitude(parts)
+    cells = QTable(np.concatenate([_rows(solution, *part) for part in parts]), copy=False)
     cells.sort("p_value")
     for name in ("x_min", "x_max", "y_min", "y_max", "dx", "dy", "sigma_dx", "sigma_dy"):
         cells[name].unit = "pix"
@@ -257,6 +258,13 @@ class _Cells:
     known: np.ndarray
     inflation: float
 
+    def take(self, mask):
+        """Keep some of the cells."""
+        return _Cells(
+            self.index[mask], self.n[mask], self.mean[:, mask], self.noise[:, mask],
+            self.known[:, mask], self.inflation,
+        )  # fmt: skip
+
     @property
     def variance(self):
         return self.noise + self.known
@@ -296,28 +304,53 @@ def _whole(solution, grids):
 def _localize(stars, grids, limit):
     """Cells that have changed, without the linear part that the attitudes have taken.
 
-    Returns the means of all grids, which cells have changed, and the stars in these.
+    First large cells that have changed as a whole, then small ones, then what is left of larger
+    ones.  Returns (grid, cells, which have changed) and the stars in those.
     """
     linear = _unchanged_linear(grids)
     ny, nx = stars.solution.image_shape
     place = [np.ones_like(stars.x), (2 * stars.x + 1) / nx - 1, (2 * stars.y + 1) / ny - 1]
     residual = stars.residual - linear @ place
     gone = np.zeros(stars.x.size, bool)
-    found, changed = {}, {}
+    parts = []
+    means = {
+        n: stars.average(n, residual=residual, inflation=g.inflation) for n, g in grids.items()
+    }
+    for n_grid, cells in means.items():
+        there = np.zeros(n_grid**2, bool)
+        there[stars.cell(n_grid)[gone]] = True
+        finer = {n: c for n, c in means.items() if n > n_grid}
+        whole = (cells.p_value < limit) & ~there[cells.index] & _uniform(n_grid, cells, finer)
+        parts.append((n_grid, cells.take(whole), np.ones(whole.sum(), bool)))
+        gone |= np.isin(stars.cell(n_grid), cells.index[whole])
     for n_grid in sorted(grids, reverse=True):
         cells = stars.average(
             n_grid, residual=residual, use=~gone, inflation=grids[n_grid].inflation
         )
-        found[n_grid], changed[n_grid] = cells, cells.p_value < limit
-        gone |= np.isin(stars.cell(n_grid), cells.index[changed[n_grid]])
+        changed = cells.p_value < limit
+        parts.append((n_grid, cells, changed))
+        gone |= np.isin(stars.cell(n_grid), cells.index[changed])
     if not gone.any():
         # Significant together, none by itself: what stands out before is all there is to show.
-        found = grids
-        changed = {n: g.p_value == min(c.p_value.min(initial=1) for c in grids.values())
-                   for n, g in grids.items()}  # fmt: skip
-        for n_grid, mask in changed.items():
-            gone |= np.isin(stars.cell(n_grid), grids[n_grid].index[mask])
-    return found, changed, gone
+        best = min(g.p_value.min(initial=1.0) for g in grids.values())
+        parts = [(n, g, g.p_value == best) for n, g in grids.items()]
+        for n_grid, cells, changed in parts:
+            gone |= np.isin(stars.cell(n_grid), cells.index[changed])
+    return parts, gone
+
+
+def _uniform(n_grid, cells, finer):
+    """Whether the smaller cells within each cell agree with its mean."""
+    mean = np.zeros((2, n_grid**2))
+    mean[:, cells.index] = cells.mean
+    good = np.ones(n_grid**2, bool)
+    for n, small in finer.items():
+        parent = small.index // n * n_grid // n * n_grid + small.index % n * n_grid // n
+        square = np.sum((small.mean - mean[:, parent]) ** 2 / small.variance, axis=0)
+        total = np.bincount(parent, square, minlength=n_grid**2)
+        freedom = 2 * (np.bincount(parent, minlength=n_grid**2) - 1)
+        good &= chi2.sf(total, np.maximum(freedom, 1)) > _UNIFORM
+    return good[cells.index]
 
 
 def _unchanged_linear(grids):
@@ -364,11 +397,11 @@ def _starts(u, v):
     yield np.abs(v) > 0.3
 
 
-def _amplitude(grids, changed):
+def _amplitude(parts):
     """Root mean square of the change over the changed cells, less what noise adds."""
-    n = np.concatenate([g.n[changed[k]] for k, g in grids.items()])
+    n = np.concatenate([cells.n[changed] for _, cells, changed in parts])
     square = np.concatenate(
-        [np.sum(g.mean**2 - g.noise, axis=0)[changed[k]] for k, g in grids.items()]
+        [np.sum(cells.mean**2 - cells.noise, axis=0)[changed] for _, cells, changed in parts]
     )
     return float(np.sqrt(max(np.sum(n * square) / np.sum(n), 0.0)))
 
