@@ -7,6 +7,7 @@
 
 import math
 import os
+import pickle
 
 import numpy as np
 from astropy import coordinates as coord
@@ -343,17 +344,39 @@ def to_stock_wcs(wcs):
             f"{[type(transform).__name__ for transform in transforms]}"
         )
     distortion, sky = transforms
-    stock_distortion = _stock_distortion(distortion)
-    inverse = _stock_inverse(distortion, wcs.array_shape)
-    if inverse is not None:
-        stock_distortion.inverse = inverse
-    stock_distortion.name = "distortion_correction"
-    stock = WCS(_steps(stock_distortion, _stock_sky(sky)))
+    stock = WCS(_steps(_stock_first_step(distortion, wcs.array_shape), _stock_sky(sky)))
     if wcs.pixel_shape is not None:
         stock.pixel_shape = wcs.pixel_shape
     if wcs.bounding_box is not None:
         stock.bounding_box = wcs.bounding_box.bounding_box(order="F")
     return stock
+
+
+# The last first step, and what it was made of: all frames of a detector have it in common, and its
+# inverse takes a while.
+_last_first_step = (None, None)
+
+
+def _stock_first_step(distortion, image_shape):
+    global _last_first_step
+    table = distortion.lookup_table
+    made_of = pickle.dumps(
+        (
+            distortion.parameters,
+            (distortion.pv.degree, distortion.pv.radial, distortion.pv.parameters),
+            table and (table.x_grid, table.y_grid, table.method, table.parameters),
+            image_shape,
+        )
+    )
+    last, model = _last_first_step
+    if last != made_of:
+        model = _stock_distortion(distortion)
+        inverse = _stock_inverse(distortion, image_shape)
+        if inverse is not None:
+            model.inverse = inverse
+        model.name = "distortion_correction"
+        _last_first_step = (made_of, model)
+    return model.copy()
 
 
 def _polynomial2d(coefficients):
