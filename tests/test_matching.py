@@ -374,6 +374,99 @@ def test_refuses_when_half_of_the_frame_does_not_match(rng):
         run(field)
 
 
+# Fields that repeat themselves
+
+
+def bend(x, y):
+    """Header error and distortion of the frame, px."""
+    u, v = (x - 1024) / 1024, (y - 1024) / 1024
+    return x + 31 - 9 * v + 15 * u * v + 10 * u**3, y - 17 + 9 * u - 12 * u * u + 9 * v**3
+
+
+def make_repeating(stars, seen, rng):
+    """Sources where `seen` marks stars that are on the frame; 5 % of them lost."""
+    x, y = stars.T
+    on = seen & (x > 0) & (x < 2048) & (y > 0) & (y < 2048) & (rng.uniform(size=len(x)) > 0.05)
+    true = np.flatnonzero(on)
+    xs, ys = bend(x[true], y[true])
+    xs, ys = (p + rng.normal(size=len(true)) * 0.05 for p in (xs, ys))
+    return {"xs": xs, "ys": ys, "xr": x, "yr": y, "true": true, "shape": SHAPE}
+
+
+def make_lattice(rng, *, step=100.0, jitter=0.0, margin=600):
+    nodes = np.arange(-margin, 2048 + margin, step)
+    stars = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2)
+    stars = stars + rng.normal(size=stars.shape) * jitter
+    return make_repeating(stars, np.ones(len(stars), bool), rng)
+
+
+@pytest.mark.parametrize("margin", [600, 0], ids=["endless", "as large as the frame"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_refuses_a_perfect_lattice(seed, margin):
+    with pytest.raises(MatchError, match="match is ambiguous|no match with sufficient evidence"):
+        run(make_lattice(np.random.default_rng(seed), margin=margin), brightness=False)
+
+
+@pytest.mark.parametrize("jitter", [5.0, 15.0])
+def test_solves_a_jittered_lattice(rng, jitter):
+    field = make_lattice(rng, step=60.0, jitter=jitter)
+    i, j, _ = run(field, brightness=False)
+    assert_right(field, i, j)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_lattice_of_little_jitter_is_never_silently_wrong(seed):
+    field = make_lattice(np.random.default_rng(seed), step=80.0, jitter=1.0)
+    try:
+        i, j, _ = run(field, brightness=False)
+    except MatchError:
+        return
+    assert_right(field, i, j)
+
+
+def make_copies(rng, *, angle=0.0, share=1.0):
+    """A catalogue with every star (or a share of them) twice, the second one shifted and turned."""
+    stars = rng.uniform(-300, 2348, (900, 2))
+    c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    copies = (stars - 1024) @ np.array([[c, s], [-s, c]]) + 1024 + [137.0, -81.0]
+    copies = copies[rng.uniform(size=len(copies)) < share]
+    return np.vstack([stars, copies]), np.arange(900 + len(copies)) < 900
+
+
+@pytest.mark.parametrize("angle", [0.0, 1.0])
+@pytest.mark.parametrize("first", [True, False])
+def test_refuses_a_catalogue_that_has_the_field_twice(rng, angle, first):
+    stars, original = make_copies(rng, angle=angle)
+    field = make_repeating(stars, original == first, rng)
+    with pytest.raises(MatchError, match=r"ambiguous: \d+ pairs .* and \d+ pairs .* px apart"):
+        run(field, brightness=False)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1.0])
+def test_solves_a_field_of_which_a_part_comes_twice(rng, angle):
+    stars, original = make_copies(rng, angle=angle, share=0.4)
+    field = make_repeating(stars, original, rng)
+    i, j, _ = run(field, brightness=False)
+    assert_right(field, i, j)
+
+
+def test_solves_a_field_that_is_seen_twice(rng):
+    stars, original = make_copies(rng)
+    field = make_repeating(stars, np.ones(len(stars), bool), rng)
+    i, j, _ = run(field, brightness=False)
+    assert_right(field, i, j)
+
+
+def test_blind_refuses_a_field_that_is_its_own_half_turn(rng):
+    half = rng.uniform(-300, 2348, (300, 2))
+    stars = np.vstack([half, 2047 - half])
+    field = make_repeating(stars, np.ones(len(stars), bool), rng)
+    i, j, _ = run(field, brightness=False)
+    assert_right(field, i, j)
+    with pytest.raises(MatchError, match="match is ambiguous"):
+        run(field, brightness=False, blind=True)
+
+
 # Odd input that has a right answer
 
 

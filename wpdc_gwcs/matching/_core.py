@@ -3,6 +3,7 @@
 import time
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
@@ -17,7 +18,12 @@ __all__ = ["match_planes"]
 _MAX_DISTORTION = 250.0
 _MAX_DISTORTION_SHARE = 0.12
 
+# The fits are small and many: threads for linear algebra would wait for each other a thousand times
+# longer than they work as soon as another process is busy.
+_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 
+
+@_one_thread
 def match_planes(
     xs,
     ys,
@@ -157,9 +163,9 @@ def match_planes(
     found = (
         search.from_start(start, clock) if start is not None else search.by_patterns(blind, clock)
     )
-    mapping, evidence, (i, j), n_ambiguous, scatter, radius, parity = found
+    evidence, mapping, (i, j) = found.evidence, found.mapping, found.pairs
     shift, matrix = mapping.linear_part()
-    if parity < 0:
+    if found.parity < 0:
         matrix = matrix @ np.diag([-1, 1])
     return (
         *_in_source_order(rows_s[i], rows_r[j]),
@@ -171,17 +177,17 @@ def match_planes(
             purity=evidence.purity,
             completeness=evidence.completeness,
             significance=evidence.significance,
-            n_ambiguous=n_ambiguous,
+            n_ambiguous=found.n_ambiguous,
             n_duplicates=duplicates_s + duplicates_r,
-            scatter=scatter,
-            radius=radius,
+            scatter=found.scatter,
+            radius=float(np.median(found.radius)),
             mapping=mapping,
             shift=(float(shift[0]), float(shift[1])),
             rotation=float(
                 np.rad2deg(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
             ),
             scale=float(np.sqrt(abs(np.linalg.det(matrix)))),
-            parity=parity,
+            parity=found.parity,
             areas=evidence.areas,
             timings=clock.laps,
         ),

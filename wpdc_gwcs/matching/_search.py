@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from wpdc_gwcs.exceptions import MatchError
-from wpdc_gwcs.matching._evidence import collect_evidence
+from wpdc_gwcs.matching._evidence import Evidence, collect_evidence
 from wpdc_gwcs.matching._features import (
     MAX_NEIGHBOURS,
     N_NEIGHBOURS,
@@ -19,6 +19,7 @@ from wpdc_gwcs.matching._features import (
 from wpdc_gwcs.matching._local import LocalCorrection
 from wpdc_gwcs.matching._mapping import SmoothMap, fit_smooth_map, scatter_of
 from wpdc_gwcs.matching._pairs import find_edges, find_nearest, one_to_one
+from wpdc_gwcs.matching._rivals import find_rival_offset
 
 __all__ = ["Limits", "Search", "Stars"]
 
@@ -40,6 +41,12 @@ _BUDGET = 100_000_000
 _MOST_PARTIAL = 3
 # Groups of hypotheses that are followed up.
 _N_SEEDS = 8
+# Groups with this share of the support of one that has led to a match are followed too; a second
+# match with this share of the evidence of the first (in -2 ln P) is as good, and the better one of
+# two is looked for this many times.
+_RIVAL_SUPPORT = 0.3
+_EQUAL = 0.7
+_MOST_RIVALS = 4
 # Triples of pairs tried for a linear mapping, and the share of pairs that should follow it.
 _N_TRIPLES = 1000
 _AGREEING_SHARE = 0.2
@@ -112,6 +119,30 @@ class Limits:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Match:
+    """What a search found: the mapping, the pairs and their evidence."""
+
+    turn: np.ndarray
+    turned_mapping: SmoothMap
+    mapped: np.ndarray
+    radius: np.ndarray
+    pairs: tuple
+    n_ambiguous: int
+    scatter: float
+    evidence: Evidence
+
+    @property
+    def mapping(self):
+        """The mapping of the frame as it was given."""
+        return _turn_mapping(self.turned_mapping, self.turn)
+
+    @property
+    def parity(self):
+        """-1 where the frame is mirrored."""
+        return int(np.sign(np.linalg.det(self.turn)))
+
+
 @dataclass(eq=False)
 class Search:
     """One search: two lists and the rules; tries starts until one has evidence."""
@@ -144,10 +175,10 @@ class Search:
         radius = np.minimum(self.limit[part], _START_RADIUS)
         pairs, _ = _pair(mapped, radius, self.limit[part], self.stars)
         clock.lap("start")
-        found = self.finish(self.sources, (part[pairs[0]], pairs[1]), clock)
+        found = self.finish(np.eye(2), (part[pairs[0]], pairs[1]), clock)
         if found is None:
             raise self.refusal(hint=False)
-        return *found, 1
+        return self.without_rival(found, clock)
 
     def by_patterns(self, blind, clock):
         """Look stars up by their neighbourhoods, bright ones first."""
@@ -173,18 +204,39 @@ class Search:
                     ]
                 clock.lap("patterns")
                 seeds.sort(key=lambda seed: -seed[0])
-                for _, turn, sources, hypotheses in seeds[:_N_SEEDS]:
-                    for pairs in _first_pairs(sources, reference, hypotheses):
-                        found = self.try_pairs(
-                            turn, sources, rows_s, reference, rows_r, pairs, clock
-                        )
-                        if found is not None:
-                            self.check_header(found[0])
-                            parity = int(np.sign(np.linalg.det(turn)))
-                            return _turn_mapping(found[0], turn), *found[1:], parity
-                        if self.n_partial >= _MOST_PARTIAL:
-                            raise self.refusal(hint=False)
+                found = self.follow(seeds[:_N_SEEDS], rows_s, reference, rows_r, clock)
+                if found is not None:
+                    return found
         raise self.refusal(hint=not blind)
+
+    def follow(self, seeds, rows_s, reference, rows_r, clock):
+        """Follow groups of hypotheses until one has evidence, and those that could rival it."""
+        best, best_support, beyond = None, 0.0, None
+        for support, turn, sources, hypotheses in seeds:
+            if best is not None and (
+                support < _RIVAL_SUPPORT * best_support
+                or self.is_explained(best, rows_s[hypotheses.source], rows_r[hypotheses.reference])
+            ):
+                continue
+            for pairs in _first_pairs(sources, reference, hypotheses):
+                found = self.try_pairs(turn, sources, rows_s, reference, rows_r, pairs, clock)
+                if found is None:
+                    if self.n_partial >= _MOST_PARTIAL and best is None:
+                        raise self.refusal(hint=False)
+                    continue
+                error = self.header_error(found.turned_mapping)
+                if error is not None:
+                    beyond = beyond or error
+                elif best is None:
+                    best, best_support = found, support
+                else:
+                    best = self.prefer(best, found)
+                break
+        if best is not None:
+            return self.without_rival(best, clock)
+        if beyond is not None:
+            raise beyond
+        return None
 
     def try_pairs(self, turn, sources, rows_s, reference, rows_r, pairs, clock):
         """Grow from first pairs of a subset to the frame; None without evidence."""
@@ -196,7 +248,7 @@ class Search:
         if key in self.seen:
             return None
         self.seen.add(key)
-        return self.finish(self.turned(turn), pairs, clock)
+        return self.finish(turn, pairs, clock)
 
     def turned(self, turn):
         """All sources, turned about the centre of the frame."""
@@ -380,8 +432,9 @@ class Search:
                 break
         return fit, local, pairs, scatter
 
-    def finish(self, points, pairs, clock):
+    def finish(self, turn, pairs, clock):
         """Grow over all stars, pair with the final radius, judge; None without evidence."""
+        points = self.turned(turn)
         fit = self.fit(points[pairs[0]], self.stars.points[pairs[1]])
         if fit is None:
             return None
@@ -413,7 +466,7 @@ class Search:
             # right as a whole but for a part of the frame: other starts seldom help
             self.n_partial += evidence.significance >= self.rules["min_significance"]
             return None
-        return fit.mapping, evidence, pairs, n_ambiguous, scatter, float(np.median(radius))
+        return Match(turn, fit.mapping, mapped, radius, pairs, n_ambiguous, scatter, evidence)
 
     def fit(self, points, reference, *, max_order=None, **options):
         """Fit a smooth mapping in the frame's own units."""
@@ -442,10 +495,65 @@ class Search:
         radius = _FINAL_RADIUS * np.sqrt(own**2 + scatter**2 * leverage)
         return np.maximum(radius, _SMALLEST_RADIUS)
 
+    # rivals
+
+    def is_explained(self, match, i, j):
+        """Whether most of some candidate pairs agree with a match to within a few radii."""
+        gap = np.hypot(*(match.mapped[i] - self.stars.points[j]).T)
+        return np.mean(gap <= 3 * match.radius[i]) > 0.5
+
+    def prefer(self, one, other):
+        """Choose the better of two matches; refuse if both are equally good and not the same."""
+        _, a, b = np.intersect1d(one.pairs[0], other.pairs[0], return_indices=True)
+        strengths = [m.evidence.significance**2 for m in (one, other)]
+        better, worse = (one, other) if strengths[0] >= strengths[1] else (other, one)
+        if len(a) and np.mean(one.pairs[1][a] == other.pairs[1][b]) > 0.5:
+            return better
+        if min(strengths) < _EQUAL * max(strengths):
+            return better
+        gap = np.median(np.hypot(*(one.mapped - other.mapped).T))
+        raise MatchError(
+            f"the match is ambiguous: {one.evidence.n_pairs} pairs "
+            f"({one.evidence.significance:.1f} sigma) and {other.evidence.n_pairs} pairs "
+            f"({other.evidence.significance:.1f} sigma) of two mappings that are {gap:.4g} px "
+            "apart suit about equally well: the field or the catalogue repeats itself"
+        )
+
+    def without_rival(self, match, clock):
+        """Make sure that no shift matches the same sources to other stars equally well."""
+        for _ in range(_MOST_RIVALS):
+            i, j = match.pairs
+            offset = find_rival_offset(
+                match.mapped[i],
+                j,
+                self.stars.tree,
+                float(np.median(match.radius)),
+                center=-match.turned_mapping.linear_part()[0],
+                max_offset=self.limits.max_shift,
+            )
+            clock.lap("rivals")
+            if offset is None:
+                return match
+            mapped = match.mapped + offset
+            pairs, _ = _pair(mapped, match.radius, self.limit, self.stars)
+            if len(pairs[0]) < MIN_STARS:
+                return match
+            rival = self.finish(match.turn, pairs, clock)
+            if rival is None or self.header_error(rival.turned_mapping) is not None:
+                return match
+            better = self.prefer(match, rival)
+            if better is match:
+                return match
+            match = better
+        raise MatchError(
+            f"the match is ambiguous: {_MOST_RIVALS} times over another shift suited the sources "
+            "better: the field or the catalogue repeats itself"
+        )
+
     # refusals
 
-    def check_header(self, mapping):
-        """Refuse what is further from the header than allowed, naming it."""
+    def header_error(self, mapping):
+        """Build the error that names what is further from the header than allowed, or None."""
         shift, matrix = mapping.linear_part()
         shift = float(np.hypot(*shift))
         rotation = float(
@@ -459,10 +567,11 @@ class Search:
             ("scale", 100 * abs(scale - 1), 100 * limits.max_scale, "%"),
         ):
             if value > most:
-                raise MatchError(
+                return MatchError(
                     f"the {what} of the starting WCS is off by {value:.4g} {unit}, "
                     f"{most:.4g} {unit} are allowed; {_HINT}"
                 )
+        return None
 
     def note_failure(self, evidence):
         if self.best_failure is None or evidence.significance > self.best_failure.significance:
