@@ -296,6 +296,42 @@ def test_evaluate_prints_and_writes(results, tmp_path, capsys):
     assert 0.01 < found["sigma_dx"][0] < 0.1
 
 
+def test_evaluate_compares_the_weights(inputs, results, tmp_path, capsys):
+    assert run(["evaluate", str(results)]) == 0
+    out = capsys.readouterr().out
+    for name in ("exp-sqrt", "gaussian", "inverse", "inverse-square", "uniform"):
+        assert len(re.findall(rf"^sim +{name} .*(?:no|yes) ", out, re.MULTILINE)) == 2
+    table = tmp_path / "table.ecsv"
+    command = ["evaluate", str(results), "--catalog", inputs[1], "--output", str(table)]
+    assert run([*command, "--plots", str(tmp_path / "plots")]) == 0
+    weights = Table.read(tmp_path / "table.weights.ecsv")
+    assert len(weights) == 10
+    assert np.all(weights["n"] > 800)
+    # 0.05 px of centroid noise are left with a table, whatever the weight
+    assert np.ptp(weights["sigma_dx"][weights["table"] == "yes"]) < 0.003
+    names = sorted(p.name for p in (tmp_path / "plots").iterdir())
+    assert names == sorted(
+        ["sim.weights.png"]
+        + [f"sim-0{k}.{kind}.png" for k in (1, 2)
+           for kind in ("cdf", "magnitude", "maps", "residuals")]
+    )  # fmt: skip
+    assert run(command) == 2
+    assert "table.ecsv: file exists" in error_of(capsys)
+    assert run(["evaluate", str(results), "--no-weights"]) == 0
+    assert "uniform" not in capsys.readouterr().out
+
+
+def test_evaluate_refuses_another_catalogue(inputs, results, tmp_path, capsys):
+    short = Table.read(inputs[1])[:50]
+    short.write(tmp_path / "short.fits")
+    assert run(["evaluate", str(results), "--catalog", str(tmp_path / "short.fits")]) == 2
+    assert "short.fits: sim-01 refers to row" in error_of(capsys)
+    short.remove_column("phot_g_mean_mag")
+    short.write(tmp_path / "plain.fits")
+    assert run(["evaluate", str(results), "--catalog", str(tmp_path / "plain.fits")]) == 2
+    assert "plain.fits: the catalogue has no magnitudes" in error_of(capsys)
+
+
 def test_report_is_written_once(results, tmp_path, capsys):
     page = tmp_path / "page.html"
     assert run(["report", str(results), "--output", str(page)]) == 0
@@ -320,7 +356,11 @@ def test_monitor_tells_a_changed_table(results, tmp_path, capsys):
     matches.write(tmp_path / "sim-01.matches.ecsv")
     cells = tmp_path / "cells.ecsv"
     assert run(["monitor", solution, str(tmp_path), "--output", str(cells)]) == 1
-    assert "sim: has drifted" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "sim: has drifted" in out
+    by, area = re.search(r"by (0\.\d+) px rms in (\d+)% of the detector", out).groups()
+    assert abs(float(by) - 0.1) < 0.02
+    assert abs(int(area) - 25) < 8
     assert Table.read(cells)["changed"][0]
     assert run(["monitor", str(results / "sim-01.wcs.asdf"), str(tmp_path)]) == 2
     assert "needs a *.solution.asdf file" in error_of(capsys)

@@ -1,5 +1,7 @@
 """Residual statistics against closed forms and brute force."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -7,9 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from wpdc_gwcs.evaluation import binned_residuals, d80, detect_drift, evaluate, robust_scatter
-from wpdc_gwcs.models import LookupTable, PVPolynomial
-from wpdc_gwcs.solution import DistortionSolution
+from wpdc_gwcs.evaluation import (
+    binned_residuals,
+    compare_weights,
+    d80,
+    detect_drift,
+    evaluate,
+    robust_scatter,
+    running_statistics,
+    tabulate_weights,
+)
+from wpdc_gwcs.exceptions import FitError
+from wpdc_gwcs.fitting import RadialWeight
+from wpdc_gwcs.models import LookupTable, PVPolynomial, deproject
+from wpdc_gwcs.solution import Calibration, DistortionSolution
 
 
 def test_moments_of_a_normal_distribution_with_wrong_matches():
@@ -184,3 +197,154 @@ def test_drift_needs_stars_and_a_probability():
         detect_drift(make_solution(0.001), make_matches(rng, 5))
     with pytest.raises(ValueError, match="false_alarm must be between 0 and 1, got 2"):
         detect_drift(make_solution(0.001), make_matches(rng, 500), false_alarm=2)
+
+
+def without_linear(table):
+    """What the attitude of a frame leaves of its residuals."""
+    columns = np.stack([np.ones(len(table)), table["x"], table["y"]], axis=1)
+    for name in ("dx", "dy"):
+        values = np.asarray(table[name])
+        table[name] = values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
+    return table
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        lambda u, v: (u > 0) & (v < 0),
+        lambda u, v: u < -0.5,
+        lambda u, v: np.maximum(abs(u), abs(v)) < 0.5,
+        lambda u, v: abs(v - 0.25) < 0.25,
+    ],
+    ids=["corner", "strip", "centre", "band"],
+)
+def test_what_the_attitudes_took_of_a_change_is_given_back(part):
+    """A quarter changes by 0.05 px, and each frame has its linear part in its attitude."""
+    rng = np.random.default_rng(17)
+    tables = [make_matches(rng, 8000) for _ in range(5)]
+    for table in tables:
+        changed = part(table["x"] / 600 - 1, table["y"] / 500 - 1)
+        table["dx"][changed] += 0.03
+        table["dy"][changed] -= 0.04
+    drift = detect_drift(make_solution(0.001), [without_linear(t) for t in tables])
+    assert drift.drifted
+    assert drift.amplitude == pytest.approx(0.05, rel=0.06)
+    assert drift.area == pytest.approx(0.25, abs=0.03)
+    x, y = np.meshgrid(np.linspace(0, 1199, 80), np.linspace(0, 999, 80))
+    named = np.zeros(x.shape, bool)
+    for c in drift.cells[drift.cells["changed"]]:
+        left, right, low, high = (c[k].value for k in ("x_min", "x_max", "y_min", "y_max"))
+        named |= (x >= left) & (x < right) & (y >= low) & (y < high)
+    assert np.mean(named == part(x / 600 - 1, y / 500 - 1)) > 0.95
+    largest = drift.cells[drift.cells["changed"]]
+    largest = largest[np.argmax(largest["n"])]
+    assert largest["dx"].value == pytest.approx(0.03, abs=5 * largest["sigma_dx"].value)
+    assert largest["dy"].value == pytest.approx(-0.04, abs=5 * largest["sigma_dy"].value)
+
+
+def test_turbulence_is_no_drift():
+    """Waves that differ between frames are common to the stars of a cell, not to the frames."""
+    rng = np.random.default_rng(18)
+    alarms = 0
+    for _ in range(30):
+        tables = [make_matches(rng, 2000) for _ in range(5)]
+        for table in tables:
+            phase, k = rng.uniform(0, 6.28), rng.uniform(-0.015, 0.015, 2)
+            wave = np.sin(k[0] * table["x"] + k[1] * table["y"] + phase)
+            table["dx"] += 0.02 * wave
+        alarms += detect_drift(make_solution(0.001), [without_linear(t) for t in tables]).drifted
+    assert alarms <= 2
+
+
+def test_small_changes_everywhere_count_together():
+    """No cell alone shows a pattern of 0.006 px; the whole detector does."""
+    rng = np.random.default_rng(19)
+    tables = [make_matches(rng, 8000) for _ in range(5)]
+    for table in tables:
+        ix, iy = (np.asarray(table[c]) // s for c, s in (("x", 150.0), ("y", 125.0)))
+        table["dx"] += 0.006 * np.sign(np.sin(3 * ix + 5 * iy + ix * iy))
+    drift = detect_drift(make_solution(0.0), tables)
+    assert drift.drifted
+    assert not drift.cells["p_value"].min() * len(drift.cells) / drift.p_value < 1e-3
+
+
+def test_running_statistics(rng):
+    values = rng.permutation(200.0 + np.arange(100))
+    dx = 0.01 * (values - 200)
+    table = running_statistics(values, dx, -dx, n_bins=4)
+    np.testing.assert_allclose(table["low"], [200, 225, 250, 275])
+    np.testing.assert_allclose(table["high"], [224, 249, 274, 299])
+    np.testing.assert_allclose(table["mean_dx"], [0.12, 0.37, 0.62, 0.87])
+    np.testing.assert_allclose(table["mean_dy"], -np.asarray(table["mean_dx"]))
+    assert len(running_statistics(values[:15], dx[:15], dx[:15])) == 1
+    assert running_statistics([], [], [])["n"].tolist() == [0]
+    with pytest.raises(ValueError, match="n_bins must be at least 1, got 0"):
+        running_statistics(values, dx, dx, n_bins=0)
+
+
+def make_calibrations(rng, *, n=3, stars=1500, holdout=False):
+    """Frames of a detector with a quartic distortion, each in its true attitude."""
+    cd, crpix = np.diag([-2e-5, 2e-5]), np.array([599.5, 499.5])
+    solution = DistortionSolution("d", SHAPE, crpix, cd, np.array([10.0, 20.0]), PVPolynomial())
+    found = []
+    for k in range(n):
+        x, y = rng.uniform(-0.5, 1199.5, stars), rng.uniform(-0.5, 999.5, stars)
+        u, v = (x - crpix[0]) / 600, (y - crpix[1]) / 600
+        noise = rng.normal(0, 0.02, (2, stars))
+        crval = np.array([10.0 + 0.01 * k, 20.0])
+        true = np.array([x - crpix[0] + u**3 + 0.5 * u**4, y - crpix[1] + v**3 - v**4])
+        ra, dec = deproject(*(cd @ (true + noise)), crval)
+        error = np.full(stars, 0.02)
+        held = rng.uniform(size=stars) < 0.2 if holdout else np.zeros(stars, bool)
+        matches = Table(
+            {"x": x, "y": y, "x_err": error, "y_err": error, "ra": ra, "dec": dec,
+             "dx": noise[0], "dy": noise[1], "used": ~held, "holdout": held}
+        )  # fmt: skip
+        found.append(Calibration(f"f{k}", solution, crval, cd, matches=matches))
+    return found
+
+
+def test_weights_against_least_squares(rng):
+    """The polynomial of each weight against numpy; the table takes what it leaves."""
+    calibrations = make_calibrations(rng)
+    results = compare_weights(calibrations, r0=400.0)
+    assert [r.weight.name for r in results] == list(RadialWeight.names)
+    x, y = (np.concatenate([np.asarray(c.matches[k]) for c in calibrations]) for k in "xy")
+    u, v = (x - 599.5) / 600, (y - 499.5) / 600
+    terms = np.stack([u**i * v**j for i in range(4) for j in range(4 - i)], axis=1)
+    for r in results:
+        # Residual = polynomial - reference: the quartic is what no polynomial follows.
+        noise = np.concatenate([np.asarray(c.matches["dx"]) for c in calibrations])
+        target = u**3 + 0.5 * u**4 + noise
+        root = np.sqrt(RadialWeight(r.weight.name, r0=400.0)(600 * np.hypot(u, v)))
+        fit = terms @ np.linalg.lstsq(terms * root[:, None], target * root, rcond=None)[0]
+        np.testing.assert_allclose(r.dx, fit - target, atol=1e-5)
+        assert r.statistics.sigma_dx == pytest.approx(evaluate(fit - target, r.dy).sigma_dx, 1e-3)
+        assert r.table_statistics.sigma_dx == pytest.approx(0.02, rel=0.08)
+        assert not r.held_out
+    total = [np.mean(r.dx**2) for r in results]
+    assert min(total) == total[-1]  # least squares with equal weights, nothing clipped
+    table = tabulate_weights(results)
+    assert len(table) == 10
+    assert list(table["table"][:2]) == ["no", "yes"]
+    assert table["d80_dx"][1] == results[0].table_statistics.d80_dx
+
+
+def test_weights_are_judged_by_held_out_stars(rng):
+    calibrations = make_calibrations(rng, n=1, holdout=True)
+    (result,) = compare_weights(calibrations[0], weights=["inverse"])
+    assert result.held_out
+    assert result.dx.size == calibrations[0].matches["holdout"].sum()
+    assert result.weight.r0 == pytest.approx(0.87 * 500)
+    assert tabulate_weights([result])["stars"][0] == "holdout"
+
+
+def test_weights_need_matches_of_one_detector(rng):
+    one = make_calibrations(rng, n=1)[0]
+    with pytest.raises(ValueError, match="frames with their matches"):
+        compare_weights(replace(one, matches=None))
+    other = replace(one, solution=replace(one.solution, detector="e"))
+    with pytest.raises(ValueError, match="frames must be of one detector, got 'd' .* and 'e'"):
+        compare_weights([one, other])
+    with pytest.raises(FitError, match="weight exp-sqrt with r0 = 3 px: .* stars"):
+        compare_weights(replace(one, matches=one.matches[:8]), r0=3.0)

@@ -5,6 +5,8 @@ import pytest
 from astropy.table import Table
 
 from wpdc_gwcs import plotting
+from wpdc_gwcs.evaluation import WeightResult, d80, evaluate
+from wpdc_gwcs.fitting import RadialWeight
 from wpdc_gwcs.models import LookupTable
 
 SHAPE = (800, 1000)
@@ -120,3 +122,40 @@ def test_missing_columns_are_named(matches):
     matches.remove_column("dy")
     with pytest.raises(ValueError, match="must have the columns x, y, dx, dy; no dy"):
         plotting.plot_cdf(matches)
+
+
+def test_magnitudes_are_found_by_name(matches, saved, rng):
+    with pytest.raises(ValueError, match="matches must have one of the columns phot_g_mean_mag"):
+        plotting.plot_residuals_vs_magnitude(matches)
+    matches["snr"] = rng.uniform(10, 1000, len(matches))
+    figure = saved(plotting.plot_residuals_vs_magnitude(matches))
+    assert figure.axes[0].get_xlabel() == "signal-to-noise ratio"
+    assert figure.axes[0].get_xscale() == "log"
+    matches["phot_g_mean_mag"] = rng.uniform(17, 24, len(matches))
+    matches["phot_g_mean_mag"][:100] = np.nan
+    figure = saved(plotting.plot_residuals_vs_magnitude(matches))
+    assert figure.axes[2].get_xlabel() == "G [mag]"
+    for line in figure.axes[2].get_lines():
+        np.testing.assert_allclose(line.get_ydata(), 0.05, rtol=0.2)
+
+
+def test_weights_are_told_apart(saved, rng):
+    results = []
+    for k, name in enumerate(RadialWeight.names):
+        dx, dy = rng.normal(0, 0.1 * (k + 1), (2, 400))
+        results.append(
+            WeightResult(
+                RadialWeight(name), dx, dy, 0.5 * dx, 0.5 * dy, evaluate(dx, dy),
+                evaluate(0.5 * dx, 0.5 * dy), held_out=False,
+            )
+        )  # fmt: skip
+    figure = saved(plotting.plot_weights(results))
+    panels = figure.axes
+    assert len(panels) == 4
+    for axes, name in zip(panels, ("dx", "dy", "table_dx", "table_dy")):
+        texts = [t.get_text() for t in axes.get_legend().get_texts()]
+        assert [t.split(":")[0] for t in texts] == list(RadialWeight.names)
+        for r, text in zip(results, texts):
+            assert float(text.split()[-2]) == pytest.approx(d80(getattr(r, name)), rel=0.06)
+    looks = {(line.get_color(), line.get_linestyle()) for line in panels[0].get_lines()[2:]}
+    assert len(looks) == 5

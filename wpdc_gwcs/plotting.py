@@ -6,18 +6,21 @@ kept or switched behind the caller's back.  ``figure.savefig(path)`` writes it.
 
 import numpy as np
 
-from wpdc_gwcs.evaluation import binned_residuals, d80, evaluate
+from wpdc_gwcs.evaluation import binned_residuals, d80, evaluate, running_statistics
 
 __all__ = [
     "plot_cdf",
     "plot_lookup_table",
     "plot_residual_arrows",
     "plot_residual_maps",
+    "plot_residuals_vs_magnitude",
     "plot_residuals_vs_position",
+    "plot_weights",
 ]
 
 # Okabe and Ito's colours, told apart with any colour vision.
 _BLUE, _ORANGE, _GREY = "#0072B2", "#D55E00", "#999999"
+_OTHERS = ("#009E73", "#CC79A7", "#000000")
 _DIVERGING, _SEQUENTIAL = "RdBu_r", "viridis"
 
 
@@ -253,6 +256,114 @@ def plot_cdf(matches):
     axes.set_xlabel("residual [px]")
     axes.set_ylabel("cumulative share of the stars")
     axes.legend(loc="upper left", edgecolor="none", framealpha=1, fontsize="small")
+    return figure
+
+
+def plot_residuals_vs_magnitude(matches):
+    """Draw the residuals of each axis against magnitude, and their scatter.
+
+    Parameters
+    ----------
+    matches : `~astropy.table.Table`
+        Matches with columns ``dx``, ``dy`` in px, and one of ``phot_g_mean_mag``, ``magnitude``,
+        ``mag``, ``snr`` or ``x_err``: the first of these that is there.
+
+    Returns
+    -------
+    `matplotlib.figure.Figure`
+        Three panels: the residuals of both axes with their running median and middle 68 %, and
+        their standard deviations after 3-sigma clipping in equally filled bins.
+
+    Raises
+    ------
+    ValueError
+        If none of the columns is there.
+    """
+    labels = {
+        "phot_g_mean_mag": "G [mag]",
+        "magnitude": "magnitude",
+        "mag": "magnitude",
+        "snr": "signal-to-noise ratio",
+        "x_err": r"stated error $\sigma_x$ [px]",
+    }
+    name = next((n for n in labels if n in matches.colnames), None)
+    if name is None:
+        raise ValueError(f"matches must have one of the columns {', '.join(labels)}")
+    _, _, dx, dy = _get_columns(matches)
+    used, holdout = _get_flags(matches)
+    value = _plain(matches[name])
+    good = (used | holdout) & np.isfinite(value)
+    value, dx, dy = value[good], dx[good], dy[good]
+    figure = _new_figure(11.5, 3.9)
+    panels = figure.subplots(1, 3, sharex=True)
+    panels[1].sharey(panels[0])
+    limit = _symmetric_limit(dx, dy)
+    columns = ((dx, r"$\Delta X$", _BLUE), (dy, r"$\Delta Y$", _ORANGE))
+    for axes, (residual, label, color) in zip(panels, columns):
+        axes.plot(
+            value, residual, ls="none", marker=".", ms=_marker_size(len(value)), mew=0, alpha=0.5,
+            color=color, rasterized=True,
+        )  # fmt: skip
+        center, low, middle, high = _running_percentiles(value, residual)
+        axes.fill_between(center, low, high, color="black", alpha=0.15, lw=0, zorder=3)
+        axes.plot(center, middle, color="black", lw=1.5, zorder=4)
+        axes.axhline(0, color="black", lw=0.6, ls=":")
+        axes.set_ylim(-limit, limit)
+        axes.set_ylabel(f"{label} [px]")
+    table = running_statistics(value, dx, dy, n_bins=12)
+    for column, (_, label, color) in zip(("sigma_dx", "sigma_dy"), columns):
+        panels[2].plot(table["middle"], table[column], "o-", ms=4, color=color, label=label)
+    panels[2].set_ylim(bottom=0)
+    panels[2].set_ylabel(r"$\sigma$ after clipping [px]")
+    panels[2].legend(frameon=False)
+    for axes in panels:
+        axes.set_xlabel(labels[name])
+        if name in ("snr", "x_err") and np.all(value > 0):
+            axes.set_xscale("log")
+    return figure
+
+
+def plot_weights(results):
+    """Draw the cumulative distributions of the residuals with each radial weight.
+
+    Parameters
+    ----------
+    results : list of WeightResult
+        As returned by `~wpdc_gwcs.evaluation.compare_weights`.
+
+    Returns
+    -------
+    `matplotlib.figure.Figure`
+        Four panels: both axes, without and with a look-up table; d80 of each weight in the keys.
+    """
+    figure = _new_figure(9.5, 7.0)
+    panels = figure.subplots(2, 2, sharey=True, sharex="row")
+    colors = (_BLUE, _ORANGE, *_OTHERS)
+    styles = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)))
+    rows = (("polynomial alone", ("dx", "dy")), ("with table", ("table_dx", "table_dy")))
+    for row, (title, names) in zip(panels, rows):
+        limit = max(
+            _symmetric_limit(*(getattr(r, name) for name in names)) for r in results
+        )  # fmt: skip
+        for axes, name, label in zip(row, names, (r"$\Delta X$", r"$\Delta Y$")):
+            for level in (0.2, 0.8):
+                axes.axhline(level, color=_GREY, lw=0.8, ls=":")
+            for k, r in enumerate(results):
+                values = np.sort(getattr(r, name))
+                axes.plot(
+                    values,
+                    (np.arange(values.size) + 0.5) / values.size,
+                    color=colors[k % len(colors)],
+                    ls=styles[k % len(styles)],
+                    lw=1.5,
+                    label=f"{r.weight.name}: {_format_px(d80(values))} px",
+                )
+            axes.set_xlim(-0.6 * limit, 0.6 * limit)
+            axes.set_ylim(0, 1)
+            axes.set_xlabel(f"{label} [px], {title}")
+            axes.legend(loc="upper left", edgecolor="none", framealpha=0.9, fontsize="small",
+                        title="d80", title_fontsize="small")  # fmt: skip
+        row[0].set_ylabel("cumulative share of the stars")
     return figure
 
 

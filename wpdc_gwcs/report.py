@@ -150,6 +150,9 @@ def _frame_section(name, table, *, image_shape):
         _embed(plotting.plot_residuals_vs_position(table), f"residuals of {name}"),
         _embed(plotting.plot_cdf(table), f"distribution of the residuals of {name}"),
     ]
+    if {"phot_g_mean_mag", "snr"} & set(table.colnames):
+        figure = plotting.plot_residuals_vs_magnitude(table)
+        figures.append(_embed(figure, f"residuals of {name} against magnitude"))
     if image_shape is not None:
         figure = plotting.plot_residual_maps(table, image_shape=image_shape)
         figures.insert(0, _embed(figure, f"maps of the residuals of {name}"))

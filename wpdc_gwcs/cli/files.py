@@ -1,5 +1,7 @@
 """Commands on results: `export`, `pix2sky`, `sky2pix`, `evaluate`, `monitor`, `report`."""
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -153,43 +155,151 @@ def evaluate_command(
             metavar="PATH...", help="*.matches.ecsv files, *.wcs.asdf files, or result folders."
         ),
     ],
-    output: Output = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            metavar="FILE",
+            help="Write the tables instead of printing them: that of the frames here, that of the "
+            "weights into FILE with .weights before its suffix.",
+        ),
+    ] = None,
     plots: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Also write figures of the residuals into this folder."),
     ] = None,
+    catalog: Annotated[
+        str | None,
+        typer.Option(metavar="CAT", help="Reference catalogue of the run, for magnitudes."),
+    ] = None,
+    weights: Annotated[
+        bool,
+        typer.Option(
+            help="Fit the polynomial anew with each of the five radial weights, without and with a "
+            "table; needs the *.wcs.asdf files."
+        ),
+    ] = True,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Residuals of calibrated frames: clipped moments, d80, scatter; held-out stars apart."""
+    """Residuals of calibrated frames: clipped moments, d80, scatter; held-out stars apart.
+
+    Then the same for all frames of a detector with each of the five radial weights.
+    """
     from astropy.table import QTable
 
     from wpdc_gwcs.evaluation import evaluate
-    from wpdc_gwcs.io import read_matches, write_table
+    from wpdc_gwcs.io import write_table
 
     if plots is not None:
         require_plotting("--plots")
+    frames = [_EvaluatedFrame(path, weights or plots is not None) for path in match_files(paths)]
+    if catalog is not None:
+        _add_magnitudes(frames, catalog)
+    compared = _compare_weights(frames) if weights else {}
+    tables = {}
     rows = []
-    for path in match_files(paths):
-        matches = read_matches(path)
-        held = np.asarray(matches["holdout"], bool)
-        for stars, mask in (("used", np.asarray(matches["used"], bool)), ("holdout", held)):
+    for frame in frames:
+        for stars, mask in (("used", frame.flag("used")), ("holdout", frame.flag("holdout"))):
             if mask.any():
-                s = evaluate(np.asarray(matches["dx"])[mask], np.asarray(matches["dy"])[mask])
-                rows.append(
-                    dict(frame=path.name.removesuffix(".matches.ecsv"), stars=stars, **vars(s))
-                )
-        if plots is not None:
-            _write_plots(matches, path, plots, overwrite=overwrite)
-    table = QTable(rows)
+                dx, dy = (np.asarray(frame.matches[name])[mask] for name in ("dx", "dy"))
+                rows.append(dict(frame=frame.name, stars=stars, **vars(evaluate(dx, dy))))
+    tables["frames"] = QTable(rows)
+    if compared:
+        tables["weights"] = _table_of_weights(compared)
+    if plots is not None:
+        _write_plots(frames, compared, plots, overwrite=overwrite)
     if output is not None:
-        write_table(table, output, overwrite=overwrite)
+        files = {
+            "frames": output, "weights": output.with_suffix(".weights" + output.suffix)
+        }  # fmt: skip
+        for name in tables:
+            require_free(files[name], overwrite)
+        for name, table in tables.items():
+            write_table(table, files[name], overwrite=overwrite)
     if not quiet and output is None:
-        for name in table.colnames[4:]:
-            table[name].info.format = ".4f"
-        for line in table.pformat(max_lines=-1, max_width=-1, align=["<", "<"] + [">"] * 11):
-            typer.echo(line)
+        for k, table in enumerate(tables.values()):
+            if k:
+                typer.echo()
+            _print_statistics(table)
+
+
+def _print_statistics(table):
+    """Print statistics, the numbers of stars first, then px with four digits."""
+    words = [name for name in table.colnames if table[name].dtype.kind == "U"]
+    for name in table.colnames:
+        if table[name].dtype.kind == "f":
+            table[name].info.format = ".0f" if name == "r0" else ".4f"
+    align = ["<" if name in words else ">" for name in table.colnames]
+    for line in table.pformat(max_lines=-1, max_width=-1, align=align):
+        typer.echo(line)
+
+
+class _EvaluatedFrame:
+    """Matches of a frame, and its calibration where that is beside them."""
+
+    def __init__(self, path, with_calibration):
+        from wpdc_gwcs.io import read, read_matches, read_table
+
+        self.name = path.name.removesuffix(".matches.ecsv")
+        self.matches = read_matches(path)
+        beside = path.with_name(f"{self.name}.wcs.asdf")
+        self.calibration = None
+        if with_calibration and beside.exists():
+            self.calibration = replace(read(beside), matches=self.matches)
+        sources = path.with_name(f"{self.name}.sources.ecsv")
+        if "snr" not in self.matches.colnames and sources.exists():
+            rows = np.asarray(self.matches["source_index"])
+            self.matches["snr"] = np.asarray(read_table(sources, columns=("snr",))["snr"])[rows]
+
+    def flag(self, name):
+        return np.asarray(self.matches[name], bool)
+
+
+def _add_magnitudes(frames, catalog):
+    from wpdc_gwcs.catalogs import read_catalog
+
+    reference = read_catalog(catalog)
+    if "phot_g_mean_mag" not in reference.colnames:
+        raise InputError(f"{catalog}: the catalogue has no magnitudes (phot_g_mean_mag)")
+    # Rows that could not be used are not in the catalogue as it was read.
+    rows = np.asarray(reference["catalog_index"])
+    magnitude = np.full(int(rows.max()) + 1, np.nan)
+    magnitude[rows] = np.asarray(reference["phot_g_mean_mag"], float)
+    for frame in frames:
+        index = np.asarray(frame.matches["catalog_index"])
+        if index.max(initial=0) >= len(magnitude):
+            raise InputError(
+                f"{catalog}: {frame.name} refers to row {index.max()}, the catalogue has "
+                f"{len(magnitude)}: it is another one"
+            )
+        frame.matches["phot_g_mean_mag"] = magnitude[index]
+
+
+def _compare_weights(frames):
+    """Detector to results of the five weights, for the frames whose calibration is known."""
+    from wpdc_gwcs.evaluation import compare_weights
+
+    groups = {}
+    for frame in frames:
+        if frame.calibration is not None:
+            detector = frame.calibration.solution.detector
+            groups.setdefault(detector, []).append(frame.calibration)
+    return {detector: compare_weights(group) for detector, group in groups.items()}
+
+
+def _table_of_weights(compared):
+    from astropy.table import vstack
+
+    from wpdc_gwcs.evaluation import tabulate_weights
+
+    tables = []
+    for detector, results in compared.items():
+        table = tabulate_weights(results)
+        table.add_column(np.full(len(table), detector), name="detector", index=0)
+        tables.append(table)
+    return vstack(tables)
 
 
 def match_files(paths):
@@ -221,23 +331,33 @@ def match_files(paths):
     return found
 
 
-def _write_plots(matches, path, folder, *, overwrite):
+def _write_plots(frames, compared, folder, *, overwrite):
     from wpdc_gwcs import plotting
+    from wpdc_gwcs.cli.calibrate import file_stem
 
-    stem = path.name.removesuffix(".matches.ecsv")
+    figures = {}
+    for frame in frames:
+        m = frame.matches
+        figures[f"{frame.name}.residuals.png"] = partial(plotting.plot_residuals_vs_position, m)
+        figures[f"{frame.name}.magnitude.png"] = partial(plotting.plot_residuals_vs_magnitude, m)
+        figures[f"{frame.name}.cdf.png"] = partial(plotting.plot_cdf, m)
+        if frame.calibration is not None:
+            shape = frame.calibration.solution.image_shape
+            figures[f"{frame.name}.maps.png"] = partial(
+                plotting.plot_residual_maps, m, image_shape=shape
+            )
+    for detector, results in compared.items():
+        figures[f"{file_stem(detector)}.weights.png"] = partial(plotting.plot_weights, results)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as err:
         raise InputError(
             f"{folder}: the folder of --plots must be writable: {err.strerror}"
         ) from err
-    figures = {
-        f"{stem}.residuals.png": plotting.plot_residuals_vs_position,
-        f"{stem}.cdf.png": plotting.plot_cdf,
-    }
-    for name, plot in figures.items():
+    for name in figures:
         require_free(folder / name, overwrite)
-        plot(matches).savefig(folder / name, dpi=110)
+    for name, plot in figures.items():
+        plot().savefig(folder / name, dpi=110)
 
 
 @app.command("monitor", no_args_is_help=True)
@@ -286,6 +406,8 @@ def monitor_command(
             f"{stored.detector}: {verdict} (p = {drift.p_value:.2g}, {drift.n_stars} stars in "
             f"{len(tables)} frames)"
         )
+        if drift.drifted:
+            typer.echo(f"  by {drift.amplitude:.4f} px rms in {drift.area:.0%} of the detector")
         for cell in drift.cells[drift.cells["changed"]][:5]:
             typer.echo(
                 f"  x {cell['x_min'].value:.0f} to {cell['x_max'].value:.0f}, "

@@ -1,4 +1,4 @@
-"""Residuals of calibrated frames: statistics, maps, drift of a stored table."""
+"""Residuals: statistics, maps, the radial weights side by side, drift of a stored table."""
 
 from wpdc_gwcs.evaluation.drift import Drift, detect_drift
 from wpdc_gwcs.evaluation.residuals import (
@@ -7,14 +7,20 @@ from wpdc_gwcs.evaluation.residuals import (
     d80,
     evaluate,
     robust_scatter,
+    running_statistics,
 )
+from wpdc_gwcs.evaluation.weights import WeightResult, compare_weights, tabulate_weights
 
 __all__ = [
     "Drift",
     "ResidualStatistics",
+    "WeightResult",
     "binned_residuals",
+    "compare_weights",
     "d80",
     "detect_drift",
     "evaluate",
     "robust_scatter",
+    "running_statistics",
+    "tabulate_weights",
 ]

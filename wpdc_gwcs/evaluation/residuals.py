@@ -4,8 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.stats import SigmaClip
+from astropy.table import QTable
 
-__all__ = ["ResidualStatistics", "binned_residuals", "d80", "evaluate", "robust_scatter"]
+__all__ = [
+    "ResidualStatistics",
+    "binned_residuals",
+    "d80",
+    "evaluate",
+    "robust_scatter",
+    "running_statistics",
+]
 
 
 @dataclass(frozen=True)
@@ -197,3 +205,47 @@ def binned_residuals(x, y, dx, dy, *, image_shape, n_bins=20):
         return np.where(count, total / safe, np.nan).reshape(n_bins, n_bins)
 
     return mean(dx), mean(dy), count.reshape(n_bins, n_bins)
+
+
+def running_statistics(values, dx, dy, *, n_bins=10):
+    """Statistics of the residuals against anything: magnitude, signal to noise, position.
+
+    Parameters
+    ----------
+    values : (N,) array_like
+        What the residuals are put in order by; stars without a finite value are left out.
+    dx, dy : (N,) array_like
+        Residuals in px.
+    n_bins : int, optional
+        Number of equally filled bins; fewer where a bin would have fewer than 10 stars.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        One row per bin: ``low``, ``middle`` (median) and ``high`` of the values, and the fields of
+        `ResidualStatistics`, in px.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.evaluation import running_statistics
+    >>> rng = np.random.default_rng(1)
+    >>> magnitude = rng.uniform(18, 24, 6000)
+    >>> dx, dy = rng.normal(0, 0.01 * (magnitude - 17), (2, 6000))
+    >>> table = running_statistics(magnitude, dx, dy, n_bins=3)
+    >>> table["middle"].round(0).tolist(), table["sigma_dx"].round(2).tolist()
+    ([19.0, 21.0, 23.0], [0.02, 0.04, 0.06])
+    """
+    if n_bins < 1:
+        raise ValueError(f"n_bins must be at least 1, got {n_bins}")
+    values, dx, dy = (np.asarray(a, dtype=float) for a in (values, dx, dy))
+    good = np.isfinite(values) & np.isfinite(dx) & np.isfinite(dy)
+    values, dx, dy = values[good], dx[good], dy[good]
+    order = np.argsort(values, kind="stable")
+    rows = []
+    for i in np.array_split(order, max(1, min(n_bins, values.size // 10))):
+        ends = [np.nan] * 3 if i.size == 0 else [values[i[0]], np.median(values[i]), values[i[-1]]]
+        rows.append(
+            dict(zip(("low", "middle", "high"), map(float, ends)), **vars(evaluate(dx[i], dy[i])))
+        )
+    return QTable(rows)

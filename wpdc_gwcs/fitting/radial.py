@@ -1,6 +1,7 @@
 """Weight of a star by its distance from the reference point."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -51,6 +52,8 @@ class RadialWeight:
     >>> RadialWeight("inverse", r0=4000.0)([0.0, 4000.0, 8000.0])
     array([1. , 1. , 0.5])
     """
+
+    names: ClassVar[tuple] = _WEIGHTS
 
     name: str = "exp-sqrt"
     r0: float = 4000.0
