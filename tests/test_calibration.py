@@ -83,12 +83,19 @@ def test_held_out_stars_are_in_no_fit_and_as_good_as_the_others(run):
 def test_summary_has_a_row_per_frame(run):
     assert run.summary.colnames == [
         "frame", "detector", "status", "reason", "n_sources", "n_matched",
+        "n_pairs", "n_ambiguous", "expected_by_chance", "purity", "completeness", "significance",
         "mean_dx", "sigma_dx", "mean_dy", "sigma_dy", "holdout_sigma_dx", "holdout_sigma_dy",
         "rms_mas", "seconds",
     ]  # fmt: skip
     assert list(run.summary["status"]) == ["solved"] * 3
     assert np.all(run.summary["sigma_dx"].to_value("pix") < 0.08)
     assert np.all(np.isfinite(run.summary["holdout_sigma_dy"]))
+    for row, calibration in zip(run.summary, run.calibrations, strict=True):
+        evidence = calibration.statistics["match"]
+        for name in run.summary.colnames[6:12]:
+            assert row[name] == evidence[name]
+        assert row["n_pairs"] > 100 * row["expected_by_chance"]
+        assert 0.9 < row["completeness"] <= 1
 
 
 def test_a_stored_solution_leaves_six_numbers(simulation, catalog, run):
@@ -136,6 +143,8 @@ def test_a_frame_that_fails_leaves_the_others_alone(simulation, catalog):
     assert isinstance(found.failures["noise"], MatchError)
     assert isinstance(found.failures["empty"], DetectionError)
     assert list(found.summary["status"]) == ["failed", "solved", "failed"]
+    assert list(found.summary["n_pairs"] > 0) == [False, True, False]
+    assert list(np.isnan(found.summary["purity"])) == [True, False, True]
     assert list(found.summary["n_sources"]) == [60, len(good.load_sources()), 0]
     assert "no rows" in found.summary["reason"][2]
 

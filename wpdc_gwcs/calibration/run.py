@@ -237,6 +237,12 @@ def _summarize(frames, results, calibrations, failures):
             "n_sources": result.n_sources,
             "n_matched": 0 if found is None else found.statistics["n_matched"],
         }
+        # A frame may be matched with good evidence and fail afterwards.
+        evidence = getattr(result, "diagnostics", None)
+        for name in ("n_pairs", "n_ambiguous"):
+            row[name] = getattr(evidence, name, 0)
+        for name in ("expected_by_chance", "purity", "completeness", "significance"):
+            row[name] = getattr(evidence, name, np.nan)
         statistics = {} if found is None else found.statistics
         inside, outside = (statistics.get(key, {}) for key in ("residuals", "holdout"))
         for name in ("mean_dx", "sigma_dx", "mean_dy", "sigma_dy"):
