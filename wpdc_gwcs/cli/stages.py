@@ -57,7 +57,7 @@ def detect_command(
 
     require_free(output, overwrite)
     try:
-        settings = Settings(centroids=centroids, threshold=threshold)
+        settings = Settings(centroids=centroids, threshold=threshold, min_snr=0)
     except ValueError as err:
         raise InputError(str(err)) from err
     sources = measure_sources(one_frame(frame), settings)
@@ -88,24 +88,25 @@ def match_command(
 ):
     """Match the sources of a frame to a catalogue; exit status 1 without enough evidence."""
     import numpy as np
-    from astropy.table import QTable
 
     from wpdc_gwcs.calibration import Settings, match_frame
     from wpdc_gwcs.catalogs import read_catalog
     from wpdc_gwcs.io import write_table
+    from wpdc_gwcs.matching import pair_table
 
     require_free(output, overwrite)
     matched = match_frame(one_frame(frame, wcs=wcs), read_catalog(catalog), Settings(blind=blind))
-    i_src, i_ref = matched.pairs
-    table = QTable(
-        {
-            "source_index": i_src,
-            "catalog_index": np.asarray(matched.reference["catalog_index"])[i_ref],
-            "x": np.asarray(matched.sources["x"], float)[i_src],
-            "y": np.asarray(matched.sources["y"], float)[i_src],
-            "ra": np.asarray(matched.reference["ra"], float)[i_ref],
-            "dec": np.asarray(matched.reference["dec"], float)[i_ref],
-        }
+    i, j = matched.pairs
+    x, y = (np.asarray(matched.sources[name], float)[i] for name in ("x", "y"))
+    ra, dec = (np.asarray(matched.reference[name], float)[j] for name in ("ra", "dec"))
+    table = pair_table(
+        matched.diagnostics,
+        source_index=i,
+        catalog_index=matched.reference["catalog_index"][j],
+        detector=(x, y),
+        sky=(ra, dec),
+        start=matched.start.pixels(*matched.wcs.pixel_to_world_values(x, y)),
+        reference=matched.start.pixels(ra, dec),
     )
     write_table(table, output, overwrite=overwrite)
     if not quiet:

@@ -51,7 +51,7 @@ pointing and scale.
 from wpdc_gwcs.matching._core import match_planes
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._evidence import AreaEvidence
-from wpdc_gwcs.matching._high_level import match_sources
+from wpdc_gwcs.matching._high_level import match_sources, pair_table
 from wpdc_gwcs.matching._mapping import SmoothMap
 from wpdc_gwcs.matching._pairs import pair_nearest
 
@@ -62,4 +62,5 @@ __all__ = [
     "match_planes",
     "match_sources",
     "pair_nearest",
+    "pair_table",
 ]

@@ -10,7 +10,7 @@ from astropy.wcs.wcsapi import HighLevelWCSWrapper
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._core import match_planes
 
-__all__ = ["match_sources"]
+__all__ = ["match_sources", "pair_table"]
 
 
 def match_sources(
@@ -103,7 +103,9 @@ def match_sources(
         use &= columns["flags"] == 0
     rows = np.flatnonzero(use)
     if len(rows) == 0:
-        raise MatchError(f"none of {len(x)} sources is round, clean and bright enough to match")
+        raise MatchError(
+            f"none of {len(x)} sources has a finite position and is round, clean and bright enough"
+        )
     plane = _tangent_plane(wcs, image_shape)
     sky = wcs.pixel_to_world(x[rows], y[rows]).icrs
     xs, ys = plane.wcs_world2pix(sky.ra.deg, sky.dec.deg, 0)
@@ -125,23 +127,55 @@ def match_sources(
         blind=blind,
         **options,
     )
-    mapped_x, mapped_y = diagnostics.mapping(xs[i], ys[i])
     k = rows[i]
-    matches = QTable(
+    matches = pair_table(
+        diagnostics,
+        source_index=k,
+        catalog_index=j,
+        detector=(x[k], y[k]),
+        sky=(ra[j], dec[j]),
+        start=(xs[i], ys[i]),
+        reference=(xr[j], yr[j]),
+    )
+    return matches, diagnostics
+
+
+def pair_table(diagnostics, *, source_index, catalog_index, detector, sky, start, reference):
+    """Make the table of the pairs of a match.
+
+    Parameters
+    ----------
+    diagnostics : MatchDiagnostics
+        What the match says about itself; goes into the ``meta`` of the table.
+    source_index, catalog_index : (n,) array_like of int
+        Rows of the pairs in the two lists.
+    detector : (x, y)
+        Measured positions of the sources, px.
+    sky : (ra, dec)
+        Positions of the reference stars at the epoch of the frame, deg.
+    start, reference : (x, y)
+        Sources and reference stars in the plane in which they were matched, px.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        Columns as described at `match_sources`.
+    """
+    mapped = diagnostics.mapping(*start)
+    return QTable(
         {
-            "source_index": k,
-            "catalog_index": j,
-            "x": x[k] * u.pix,
-            "y": y[k] * u.pix,
-            "ra": ra[j] * u.deg,
-            "dec": dec[j] * u.deg,
-            "dx": (xs[i] - xr[j]) * u.pix,
-            "dy": (ys[i] - yr[j]) * u.pix,
-            "separation": np.hypot(mapped_x - xr[j], mapped_y - yr[j]) * u.pix,
+            "source_index": np.asarray(source_index, int),
+            "catalog_index": np.asarray(catalog_index, int),
+            "x": detector[0] * u.pix,
+            "y": detector[1] * u.pix,
+            "ra": sky[0] * u.deg,
+            "dec": sky[1] * u.deg,
+            "dx": (start[0] - reference[0]) * u.pix,
+            "dy": (start[1] - reference[1]) * u.pix,
+            "separation": np.hypot(*np.subtract(mapped, reference)) * u.pix,
         },
         meta={"evidence": diagnostics.to_dict()},
     )
-    return matches, diagnostics
 
 
 def _values(table, name, unit=None, *, required=None):
