@@ -10,7 +10,7 @@ from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._mapping import MAX_ORDER, SmoothMap
 from wpdc_gwcs.matching._search import MIN_STARS, Limits, Search, Stars
 
-__all__ = ["match_planes"]
+__all__ = ["match_planes", "prepare_search"]
 
 
 # Displacement by distortion that is searched for, px; on a small detector as a share of its side:
@@ -116,6 +116,87 @@ def match_planes(
     (True, 200, 0.573)
     """
     clock = _Clock()
+    search = prepare_search(
+        xs,
+        ys,
+        xr,
+        yr,
+        image_shape=image_shape,
+        flux=flux,
+        mag=mag,
+        x_err=x_err,
+        y_err=y_err,
+        blind=blind,
+        max_shift=max_shift,
+        max_rotation=max_rotation,
+        max_scale=max_scale,
+        max_distortion=max_distortion,
+        max_order=max_order,
+        min_significance=min_significance,
+        min_purity=min_purity,
+    )
+    clock.lap("prepare")
+    found = (
+        search.from_start(start, clock) if start is not None else search.by_patterns(blind, clock)
+    )
+    evidence, mapping, (i, j) = found.evidence, found.mapping, found.pairs
+    shift, matrix = mapping.linear_part()
+    if found.parity < 0:
+        matrix = matrix @ np.diag([-1, 1])
+    return (
+        *_in_source_order(search.source_rows[i], search.reference_rows[j]),
+        MatchDiagnostics(
+            n_sources=evidence.n_sources,
+            n_reference=evidence.n_reference,
+            n_pairs=evidence.n_pairs,
+            expected_by_chance=evidence.expected_by_chance,
+            purity=evidence.purity,
+            completeness=evidence.completeness,
+            significance=evidence.significance,
+            n_ambiguous=found.n_ambiguous,
+            n_duplicates=search.n_duplicates,
+            scatter=found.scatter,
+            radius=float(np.median(found.radius)),
+            mapping=mapping,
+            shift=(float(shift[0]), float(shift[1])),
+            rotation=float(
+                np.rad2deg(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
+            ),
+            scale=float(np.sqrt(abs(np.linalg.det(matrix)))),
+            parity=found.parity,
+            areas=evidence.areas,
+            timings=clock.laps,
+        ),
+    )
+
+
+def prepare_search(
+    xs,
+    ys,
+    xr,
+    yr,
+    *,
+    image_shape,
+    flux=None,
+    mag=None,
+    x_err=None,
+    y_err=None,
+    blind=False,
+    max_shift=None,
+    max_rotation=3.0,
+    max_scale=0.03,
+    max_distortion=None,
+    max_order=MAX_ORDER,
+    min_significance=9.0,
+    min_purity=0.9,
+):
+    """Check and clean the two lists: the first stage of `match_planes`, which has the parameters.
+
+    Returns
+    -------
+    Search
+        The lists and the rules, ready for the stages that follow.
+    """
     ny, nx = (int(n) for n in image_shape)
     if min(ny, nx) < 1:
         raise ValueError(f"image_shape must be two positive numbers (ny, nx); got {image_shape}")
@@ -146,11 +227,12 @@ def match_planes(
                 f"too few {name} to match: {len(points)} with usable positions, "
                 f"{MIN_STARS} are needed"
             )
-    stars = Stars.build(reference)
-    clock.lap("prepare")
-    search = Search(
+    return Search(
         sources=sources,
-        stars=stars,
+        stars=Stars.build(reference),
+        source_rows=rows_s,
+        reference_rows=rows_r,
+        n_duplicates=duplicates_s + duplicates_r,
         flux=flux,
         brightness=brightness,
         errors=errors,
@@ -159,38 +241,6 @@ def match_planes(
         limits=limits,
         max_order=max_order,
         rules={"min_significance": min_significance, "min_purity": min_purity},
-    )
-    found = (
-        search.from_start(start, clock) if start is not None else search.by_patterns(blind, clock)
-    )
-    evidence, mapping, (i, j) = found.evidence, found.mapping, found.pairs
-    shift, matrix = mapping.linear_part()
-    if found.parity < 0:
-        matrix = matrix @ np.diag([-1, 1])
-    return (
-        *_in_source_order(rows_s[i], rows_r[j]),
-        MatchDiagnostics(
-            n_sources=evidence.n_sources,
-            n_reference=evidence.n_reference,
-            n_pairs=evidence.n_pairs,
-            expected_by_chance=evidence.expected_by_chance,
-            purity=evidence.purity,
-            completeness=evidence.completeness,
-            significance=evidence.significance,
-            n_ambiguous=found.n_ambiguous,
-            n_duplicates=duplicates_s + duplicates_r,
-            scatter=found.scatter,
-            radius=float(np.median(found.radius)),
-            mapping=mapping,
-            shift=(float(shift[0]), float(shift[1])),
-            rotation=float(
-                np.rad2deg(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
-            ),
-            scale=float(np.sqrt(abs(np.linalg.det(matrix)))),
-            parity=found.parity,
-            areas=evidence.areas,
-            timings=clock.laps,
-        ),
     )
 
 

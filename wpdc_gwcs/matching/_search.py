@@ -21,7 +21,7 @@ from wpdc_gwcs.matching._mapping import SmoothMap, fit_smooth_map, scatter_of
 from wpdc_gwcs.matching._pairs import find_edges, find_nearest, one_to_one
 from wpdc_gwcs.matching._rivals import find_rival_offset
 
-__all__ = ["Limits", "Search", "Stars"]
+__all__ = ["Limits", "Match", "Search", "Stars", "first_pairs"]
 
 # Fewer stars than this in either list cannot give evidence whatever they do.
 MIN_STARS = 8
@@ -149,6 +149,9 @@ class Search:
 
     sources: np.ndarray
     stars: Stars
+    source_rows: np.ndarray
+    reference_rows: np.ndarray
+    n_duplicates: int
     flux: np.ndarray | None
     brightness: np.ndarray | None
     errors: np.ndarray | None
@@ -218,7 +221,7 @@ class Search:
                 or self.is_explained(best, rows_s[hypotheses.source], rows_r[hypotheses.reference])
             ):
                 continue
-            for pairs in _first_pairs(sources, reference, hypotheses):
+            for pairs in first_pairs(sources, reference, hypotheses):
                 found = self.try_pairs(turn, sources, rows_s, reference, rows_r, pairs, clock)
                 if found is None:
                     if self.n_partial >= _MOST_PARTIAL and best is None:
@@ -623,8 +626,8 @@ def _turn_mapping(mapping, turn):
     return fit.mapping
 
 
-def _first_pairs(sources, reference, hypotheses):
-    """List sets of pairs to start from, the most promising first."""
+def first_pairs(sources, reference, hypotheses):
+    """Yield sets of pairs to start from, the most promising first."""
     pairs = _neighbour_pairs(sources, reference, hypotheses)
     yield pairs
     if len(hypotheses) > 1:
