@@ -51,7 +51,7 @@ pointing and scale.
 from wpdc_gwcs.matching._core import match_planes
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._evidence import AreaEvidence
-from wpdc_gwcs.matching._high_level import match_sources, pair_table
+from wpdc_gwcs.matching._high_level import match_sources, pair_table, select_sources
 from wpdc_gwcs.matching._mapping import SmoothMap
 from wpdc_gwcs.matching._pairs import pair_nearest
 
@@ -63,4 +63,5 @@ __all__ = [
     "match_sources",
     "pair_nearest",
     "pair_table",
+    "select_sources",
 ]

@@ -10,7 +10,7 @@ from astropy.wcs.wcsapi import HighLevelWCSWrapper
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._core import match_planes
 
-__all__ = ["match_sources", "pair_table"]
+__all__ = ["match_sources", "pair_table", "select_sources"]
 
 
 def match_sources(
@@ -94,14 +94,7 @@ def match_sources(
     x, y = columns["x"], columns["y"]
     if image_shape is None:
         image_shape = _find_shape(wcs, x, y)
-    use = np.isfinite(x) & np.isfinite(y)
-    if columns["roundness"] is not None:
-        use &= ~(np.abs(columns["roundness"]) > max_roundness)
-    if columns["snr"] is not None:
-        use &= ~(columns["snr"] < min_snr)
-    if columns["flags"] is not None:
-        use &= columns["flags"] == 0
-    rows = np.flatnonzero(use)
+    rows = np.flatnonzero(_is_clean(columns, max_roundness, min_snr))
     if len(rows) == 0:
         raise MatchError(
             f"none of {len(x)} sources has a finite position and is round, clean and bright enough"
@@ -138,6 +131,35 @@ def match_sources(
         reference=(xr[j], yr[j]),
     )
     return matches, diagnostics
+
+
+def select_sources(sources, *, max_roundness=0.3, min_snr=10.0):
+    """Mark the sources that take part in a match: with a position, clean, round, bright enough.
+
+    Parameters
+    ----------
+    sources : `~astropy.table.Table`
+        As for `match_sources`.
+    max_roundness, min_snr : float
+        Largest absolute roundness and least signal-to-noise ratio.
+
+    Returns
+    -------
+    (N,) ndarray of bool
+        True for those that take part.
+    """
+    return _is_clean(_read_sources(sources, None), max_roundness, min_snr)
+
+
+def _is_clean(columns, max_roundness, min_snr):
+    use = np.isfinite(columns["x"]) & np.isfinite(columns["y"])
+    if columns["roundness"] is not None:
+        use &= ~(np.abs(columns["roundness"]) > max_roundness)
+    if columns["snr"] is not None:
+        use &= ~(columns["snr"] < min_snr)
+    if columns["flags"] is not None:
+        use &= columns["flags"] == 0
+    return use
 
 
 def pair_table(diagnostics, *, source_index, catalog_index, detector, sky, start, reference):
