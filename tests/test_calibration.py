@@ -172,6 +172,24 @@ def test_given_centroids_need_a_source_list(simulation):
         measure_sources(frame, Settings(centroids="given"))
 
 
+def test_sources_of_an_image_reach_the_least_signal_to_noise_ratio(simulation):
+    exposure = simulation.exposures[0]
+    frame = exposure.frame(image=True)
+    every, good, better = (measure_sources(frame, Settings(min_snr=limit)) for limit in (0, 10, 30))
+    assert len(every) > len(good) > len(better) > 100
+    assert every["snr"].min() < 10
+    # The deeper list holds the same measurements: faint stars are still fitted with the others.
+    assert {tuple(row) for row in better["x", "y", "flux"]} < {
+        tuple(row) for row in good["x", "y", "flux"]
+    }
+    assert better["snr"].min() > 30
+    # Within 1.5 FWHM there is about as much light as noise of the sky allows: the aperture's ratio
+    # is 0.6 to 0.7 of the fit's for a faint star, by hand 2 sqrt(pi) s / (sqrt(pi) 1.5 FWHM).
+    assert 12 < np.percentile(good["snr"], 1) < 20
+    with pytest.raises(DetectionError, match=r"none of \d+ sources has .* above 1e\+06"):
+        measure_sources(frame, Settings(min_snr=1e6))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -182,6 +200,7 @@ def test_given_centroids_need_a_source_list(simulation):
         ({"n_grid": 2}, "n_grid must be between 4 and 1000, got 2"),
         ({"holdout": 1.0}, "holdout must be between 0 and 0.9, got 1.0"),
         ({"threshold": 0.0}, "threshold must be positive, got 0"),
+        ({"min_snr": -1.0}, "min_snr must be 0 or more, got -1"),
         ({"centroids": "moment"}, "centroids must be one of psf, windowed, given"),
         ({"reference_point": "corner"}, "reference_point must be one of header, center"),
     ],

@@ -66,7 +66,7 @@ def measure_sources(frame, settings=None):
     frame : Frame
         Image or source list.
     settings : Settings, optional
-        ``centroids`` and ``threshold`` are used.
+        ``centroids``, ``threshold`` and ``min_snr`` are used.
 
     Returns
     -------
@@ -77,6 +77,11 @@ def measure_sources(frame, settings=None):
     ------
     DetectionError
         If there are no stars on the image, or no rows in the list.
+
+    Notes
+    -----
+    Fainter stars than ``min_snr`` are measured with the others, whose light they disturb, and left
+    out at the end.
     """
     settings = Settings() if settings is None else settings
     if frame.load_sources is not None:
@@ -90,18 +95,25 @@ def measure_sources(frame, settings=None):
         )
     image = frame.load_image()
     background = subtract_background(image)
-    sources = detect_sources(
+    detected = detect_sources(
         background,
         threshold=settings.threshold,
         gain=frame.gain,
         saturation=frame.saturation,
     )
-    if settings.centroids == "windowed":
-        return sources
-    epsf = build_epsf(background, sources, gain=frame.gain)
-    if epsf is None:
-        return sources
-    return fit_centroids(background, sources, epsf, gain=frame.gain)
+    sources = detected
+    if settings.centroids == "psf":
+        epsf = build_epsf(background, detected, gain=frame.gain)
+        if epsf is not None:
+            sources = fit_centroids(background, detected, epsf, gain=frame.gain)
+    # The fit's own ratio is the greater one, but for sources whose aperture is full of others.
+    snr = np.minimum(detected["flux"] / detected["flux_err"], sources["snr"])
+    if not np.any(snr > settings.min_snr):
+        raise DetectionError(
+            f"{frame.source}: none of {len(sources)} sources has a signal-to-noise ratio above "
+            f"{settings.min_snr:g}"
+        )
+    return sources[snr > settings.min_snr]
 
 
 def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):

@@ -40,6 +40,9 @@ class Settings:
         the detector is replaced by the centre.
     threshold : float, optional
         Detection threshold in standard deviations of the background.
+    min_snr : float, optional
+        Least signal-to-noise ratio, in an aperture of 1.5 FWHM in radius, of the sources kept from
+        an image; 0 keeps all that were detected.
     holdout : float, optional
         Share of the reference stars, 0 to 0.9, kept out of every fit and measured separately.
     blind : bool, optional
@@ -56,6 +59,7 @@ class Settings:
     centroids: str = "psf"
     reference_point: str = "header"
     threshold: float = 5.0
+    min_snr: float = 10.0
     holdout: float = 0.0
     blind: bool = False
     seed: int = 0
@@ -73,6 +77,8 @@ class Settings:
             raise ValueError(f"holdout must be between 0 and 0.9, got {self.holdout}")
         if not self.threshold > 0:
             raise ValueError(f"threshold must be positive, got {self.threshold}")
+        if not self.min_snr >= 0:
+            raise ValueError(f"min_snr must be 0 or more, got {self.min_snr}")
 
     def radial_weight(self, image_shape):
         """Return the radial weight for a detector.

@@ -115,6 +115,12 @@ def calibrate_command(
         float,
         typer.Option(metavar="SIGMA", help="Detection threshold over the background noise."),
     ] = 5.0,
+    min_snr: Annotated[
+        float,
+        typer.Option(
+            metavar="RATIO", help="Least signal-to-noise ratio of a source kept; 0 keeps all."
+        ),
+    ] = 10.0,
     blind: Annotated[
         bool,
         typer.Option(
@@ -176,6 +182,7 @@ def calibrate_command(
             centroids=centroids,
             reference_point=reference_point,
             threshold=threshold,
+            min_snr=min_snr,
             blind=blind,
             holdout=holdout,
             seed=seed,

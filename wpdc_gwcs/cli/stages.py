@@ -47,6 +47,12 @@ def detect_command(
     threshold: Annotated[
         float, typer.Option(metavar="SIGMA", help="Detection threshold over the background noise.")
     ] = 5.0,
+    min_snr: Annotated[
+        float,
+        typer.Option(
+            metavar="RATIO", help="Least signal-to-noise ratio of a source kept; 0 keeps all."
+        ),
+    ] = 10.0,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
@@ -57,7 +63,7 @@ def detect_command(
 
     require_free(output, overwrite)
     try:
-        settings = Settings(centroids=centroids, threshold=threshold, min_snr=0)
+        settings = Settings(centroids=centroids, threshold=threshold, min_snr=min_snr)
     except ValueError as err:
         raise InputError(str(err)) from err
     sources = measure_sources(one_frame(frame), settings)
