@@ -173,12 +173,13 @@ class TestInstrument:
             pulls += [field.errors(result, k)[0] / sigma_x, field.errors(result, k)[1] / sigma_y]
         assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.4
 
-    def test_held_out_stars(self, rng):
+    def test_held_out_stars(self, solved, rng):
         """They are predicted with the promised error, and have no influence at all."""
         field = Field(rng, n=5)
         use = rng.uniform(size=400) > 0.2
         field.exposures = [replace(e, use=use) for e in field.exposures]
-        result = field.solve()
+        choice = solved[1].table_info.choice
+        result = field.solve(table_choice=choice)
         pulls = []
         for pairs, fit in zip(field.exposures, result.exposures):
             frame = Calibration(fit.name, result.solution, fit.crval, fit.cd, fit.covariance)
@@ -191,7 +192,8 @@ class TestInstrument:
         # 400 stars, two axes: 2.5 %.
         assert 0.9 < np.std(pulls) < 1.1
         moved = [replace(e, x=np.where(use, e.x, e.x + 3)) for e in field.exposures]
-        again = solve_instrument(moved, image_shape=SHAPE, crpix=CRPIX, weight=WEIGHT)
+        field.exposures = moved
+        again = field.solve(table_choice=choice)
         assert_allclose(again.exposures[2].crval, result.exposures[2].crval, rtol=0, atol=1e-13)
         assert_allclose(again.solution.lookup_table.dx, result.solution.lookup_table.dx, atol=1e-12)
 
@@ -280,6 +282,7 @@ class TestUpdate:
         field, stored = solved
         new = Field(rng, n=6)
         result = new.solve(solution=stored.solution, update=True)
+        assert result.table_info.candidates
         before, after = stored.solution.residual_map, result.solution.residual_map
         assert after.n_stars - before.n_stars == sum(f.used.sum() for f in result.exposures)
         assert np.nanmean(result.solution.table_sigma[0]) < np.nanmean(
@@ -299,18 +302,21 @@ class TestUpdate:
 
 
 class TestRefine:
-    def test_own_polynomials(self, rng):
+    def test_own_polynomials(self, solved, rng):
         field = Field(rng, n=3, stars=600)
-        result = field.solve(refine="pv")
+        choice = solved[1].table_info.choice
+        result = field.solve(refine="pv", table_choice=choice)
         assert all(f.pv is not None for f in result.exposures)
         assert_allclose([f.pv.pv1_1.value for f in result.exposures], 1.0)
         assert result.exposures[0].pv_covariance.shape == (2, 10, 10)
         # The star noise of one exposure, extrapolated from r0 to the corners.
-        shared = field.solve()
+        shared = field.solve(table_choice=choice)
         assert field.rms(shared) < field.rms(result) < 0.15
 
-    def test_auto_keeps_what_predicts(self, rng):
-        assert Field(rng, n=3, stars=300).solve(refine="auto").exposures[0].pv is None
+    def test_auto_keeps_what_predicts(self, solved, rng):
+        choice = solved[1].table_info.choice
+        result = Field(rng, n=3, stars=300).solve(refine="auto", table_choice=choice)
+        assert result.exposures[0].pv is None
 
     def test_auto_follows_an_unstable_instrument(self, rng):
         field = Field(rng, n=4, stars=600, distortion=cubic)
@@ -332,20 +338,22 @@ class TestRefine:
 
 
 class TestRobustness:
-    def test_wrong_pairs(self, rng):
+    def test_wrong_pairs(self, solved, rng):
         field = Field(rng, n=5)
         for e in field.exposures:
             e.x[:8] += rng.normal(0, 8, 8)
             e.y[:8] += rng.normal(0, 8, 8)
-        result = field.solve()
+        result = field.solve(table_choice=solved[1].table_info.choice)
         assert field.rms(result) < 0.012
         assert np.mean([f.used[:8].mean() for f in result.exposures]) < 0.15
 
-    def test_exposure_with_wrong_matches_is_named(self, rng):
-        field = Field(rng, n=8, stars=300, distortion=cubic)
+    @pytest.mark.parametrize("wrong", ["all", "half"])
+    def test_exposure_with_wrong_matches_is_named(self, rng, wrong):
+        field = Field(rng, n=25, stars=150, distortion=cubic)
         e = field.exposures[5]
-        shuffled = rng.permutation(300)
-        field.exposures[5] = replace(e, ra=e.ra[shuffled], dec=e.dec[shuffled])
+        order = np.arange(150)
+        order[: 150 if wrong == "all" else 75] = rng.permutation(150 if wrong == "all" else 75)
+        field.exposures[5] = replace(e, ra=e.ra[order], dec=e.dec[order])
         result = field.solve(lut="none")
         assert list(result.rejected) == ["e5"]
         assert "wrong pairs" in result.rejected["e5"]
@@ -385,6 +393,26 @@ class TestRobustness:
         assert_allclose(result.exposures[0].x_err, NOISE, rtol=0.12)
         assert field.rms(result) < 0.015
 
+    def test_each_kind_of_errors_has_its_model(self, rng):
+        """Stated errors that are half of what they should be, and exposures without any."""
+        field = Field(rng, n=4, distortion=cubic)
+        field.exposures = [
+            replace(e, x_err=e.x_err / 2, y_err=e.y_err / 2)
+            if k < 2
+            else replace(e, x_err=None, y_err=None)
+            for k, e in enumerate(field.exposures)
+        ]
+        result = field.solve(lut="none")
+        models = result.solution.statistics["error_models"]
+        assert_allclose(models["stated"]["scale"], 2.0, rtol=0.15)
+        assert_allclose(models["unknown"]["scale"], NOISE, rtol=0.15)
+        assert models["stated"]["n"] + models["unknown"]["n"] == sum(
+            f.used.sum() for f in result.exposures
+        )
+        assert result.solution.statistics["error_scale"] == models["stated"]["scale"]
+        for k, error in ((0, field.exposures[0].x_err * 2), (3, np.full(400, NOISE))):
+            assert_allclose(np.median(result.exposures[k].x_err), np.median(error), rtol=0.15)
+
     def test_floor(self, rng):
         """Errors that are too optimistic for bright stars."""
         field = Field(rng, n=3, distortion=cubic, stars=1500)
@@ -420,6 +448,19 @@ class TestRobustness:
         ],
     )
     def test_nothing_usable(self, rng, change, match):
+        field = Field(rng, n=1)
+        field.exposures = [replace(field.exposures[0], **change)]
+        with pytest.raises(FitError, match=match):
+            field.solve()
+
+    @pytest.mark.parametrize(
+        ("change", "match"),
+        [
+            ({"cd": np.zeros((2, 2))}, r"exposure e0: .* got .* and \[\[0.0, 0.0\]"),
+            ({"crval": np.array([np.nan, 3.0])}, r"exposure e0: .* got \[nan, 3.0\]"),
+        ],
+    )
+    def test_nowhere_to_start(self, rng, change, match):
         field = Field(rng, n=1)
         field.exposures = [replace(field.exposures[0], **change)]
         with pytest.raises(FitError, match=match):

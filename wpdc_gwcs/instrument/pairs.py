@@ -24,6 +24,12 @@ class Pairs:
         self.has_errors = np.zeros(n, bool)
         self.valid = np.ones(n, bool)
         for e, s in zip(exposures, self.slices):
+            start = np.asarray(e.crval, dtype=float), np.asarray(e.cd, dtype=float)
+            if not all(np.isfinite(a).all() for a in start) or np.linalg.det(start[1]) == 0:
+                raise FitError(
+                    f"exposure {e.name}: it must start from a finite CRVAL and an invertible CD, "
+                    f"got {start[0].tolist()} and {start[1].tolist()}"
+                )
             for name in ("x", "y", "ra", "dec"):
                 value = np.ravel(np.asarray(getattr(e, name), dtype=float))
                 if value.size != s.stop - s.start:

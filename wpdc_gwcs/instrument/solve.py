@@ -164,6 +164,6 @@ def solve_instrument(
     else:
         solver.attach(solution)
         if update:
-            solver.update(solution, n_grid)
+            solver.update(solution, n_grid, choice=table_choice, draft=draft)
     solver.refine(refine)
     return solver.result(detector, settings, solution)

@@ -64,7 +64,7 @@ class Solver:
         self.sigma = pairs.sigma.copy()
         self.residual = np.full((2, len(pairs)), np.nan)
         self.scale = np.ones(len(pairs.exposures))
-        self.error_model = {"scale": 1.0, "floor": 0.0}
+        self.error_models = {}
         self.table = self.table_info = self.residual_map = None
         self.own_pv = [None] * len(pairs.exposures)
         self.pv = self.pv_covariance = self.cd0 = None
@@ -237,16 +237,16 @@ class Solver:
                 n_parameters = max(n_parameters, self.table_info.choice.freedom - 3)
         freedom = n_parameters + 3 * len(self.active)
         inflation = np.sqrt(n / max(n - freedom, 0.1 * n))
-        for known in (True, False):
-            group = kept & (p.has_errors == known)
+        self.error_models = {}
+        for name, members in (("stated", p.has_errors), ("unknown", ~p.has_errors)):
+            group = kept & members
             if not np.any(group):
                 continue
             scale, floor = error_model(
-                self.residual[:, group] * inflation, p.sigma[:, group], fit_floor=known
+                self.residual[:, group] * inflation, p.sigma[:, group], fit_floor=name == "stated"
             )
-            everyone = p.has_errors == known
-            self.sigma[:, everyone] = np.sqrt((scale * p.sigma[:, everyone]) ** 2 + floor**2)
-            self.error_model = {"scale": scale, "floor": floor}
+            self.sigma[:, members] = np.sqrt((scale * p.sigma[:, members]) ** 2 + floor**2)
+            self.error_models[name] = {"n": int(group.sum()), "scale": scale, "floor": floor}
 
     def solve(self, cd, degree, n_grid, lut, *, choice, draft):
         """PV, table and attitudes in turn."""
@@ -298,25 +298,25 @@ class Solver:
         self.settle_attitudes(z)
         self._reject_unconstrained()
 
-    def update(self, solution, n_grid):
+    def update(self, solution, n_grid, *, choice, draft):
         """Table anew from the stored residuals and those of these exposures."""
         if solution.residual_map is None:
             raise FitError("the stored solution holds no residual map: it cannot be updated")
         z = self.polynomial_positions(self.pairs.x, self.pairs.y)
         folds = self._folds()
-        choice, places = None, None
+        candidates, places = (), None
         for self.rounds in range(1, _MAX_ROUNDS + 1):
             self.residual_map = solution.residual_map + self._residual_map(z, folds)
-            if choice is None:
+            if choice is None and not draft:
                 choice, candidates = choose_table(self.residual_map)
             self.table, self.table_info = build_lookup_table(
                 self.residual_map, n_grid, choice=choice, draft=True
             )
             self.settle_attitudes(z)
             places, moved = self._places(places)
-            if moved < _TOLERANCE:
+            if moved < (_TOLERANCE if not draft else _DRAFT_TOLERANCE):
                 break
-        if self.table is not None:
+        if self.table is not None and not draft:
             self.table, info = build_lookup_table(self.residual_map, n_grid, choice=choice)
             self.table_info = replace(info, candidates=candidates)
             self.settle_attitudes(z)
@@ -561,8 +561,11 @@ class Solver:
             "n_exposures": len(self.active),
             "n_used": int(self.kept.sum()),
             "rounds": self.rounds,
-            "error_scale": float(self.error_model["scale"]),
-            "error_floor": float(self.error_model["floor"]),
+            # One model for pairs with stated errors, one for pairs without (there the scale is the
+            # error in px); the first of them by itself, too.
+            "error_scale": next(iter(self.error_models.values()))["scale"],
+            "error_floor": next(iter(self.error_models.values()))["floor"],
+            "error_models": self.error_models,
         }
         if self.pooled:
             statistics["attitude_variation"] = self.pooled
