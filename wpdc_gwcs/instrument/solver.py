@@ -577,6 +577,8 @@ class Solver:
         if stored is not None:
             if info is None:
                 return stored
+            for name in ("n_exposures", "n_used"):
+                statistics[name] += stored.statistics.get(name, 0)
             return replace(
                 stored,
                 lookup_table=self.table,
