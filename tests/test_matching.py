@@ -210,11 +210,12 @@ def test_mapping_keeps_shape():
         {"spurious": 1.0, "lost": 0.4},
         {"n": 60, "shift": (250.0, 150.0), "rotation": 1.0, "scale": 0.99},
         {"n": 300, "surplus": 6.0},
+        {"n": 400, "spurious": 8.0, "distortion": 100.0},
         {"n": 5000, "distortion": 100.0, "rotation": -1.0},
         {"noise": 0.0},
         {"noise": 1.0},
     ],
-    ids=["steep", "spurious", "sparse", "deep-reference", "crowded", "noise-free", "noisy"],
+    ids=["steep", "spurious", "sparse", "deep-reference", "deep-sources", "crowded", "noise-free", "noisy"],
 )
 @pytest.mark.parametrize("brightness", [True, False])
 def test_hard_fields(kwargs, brightness):

@@ -194,7 +194,7 @@ class Search:
                 seeds = []
                 for turn in turns:
                     sources = Stars.build(self.turned(turn)[rows_s])
-                    hypotheses, groups = self.seeds(
+                    hypotheses, groups, n_near = self.seeds(
                         sources,
                         reference,
                         self.flux_rank(rows_s),
@@ -203,7 +203,8 @@ class Search:
                         _BUDGET // len(turns),
                     )
                     seeds += [
-                        (support, turn, sources, hypotheses.take(rows)) for support, rows in groups
+                        (support, turn, sources, hypotheses.take(rows), n_near)
+                        for support, rows in groups
                     ]
                 clock.lap("patterns")
                 seeds.sort(key=lambda seed: -seed[0])
@@ -215,13 +216,13 @@ class Search:
     def follow(self, seeds, rows_s, reference, rows_r, clock):
         """Follow groups of hypotheses until one has evidence, and those that could rival it."""
         best, best_support, beyond = None, 0.0, None
-        for support, turn, sources, hypotheses in seeds:
+        for support, turn, sources, hypotheses, n_near in seeds:
             if best is not None and (
                 support < _RIVAL_SUPPORT * best_support
                 or self.is_explained(best, rows_s[hypotheses.source], rows_r[hypotheses.reference])
             ):
                 continue
-            for pairs in first_pairs(sources, reference, hypotheses):
+            for pairs in first_pairs(sources, reference, hypotheses, n_near):
                 found = self.try_pairs(turn, sources, rows_s, reference, rows_r, pairs, clock)
                 if found is None:
                     if self.n_partial >= _MOST_PARTIAL and best is None:
@@ -288,7 +289,7 @@ class Search:
         return None if self.flux is None else -self.flux[rows]
 
     def seeds(self, sources, reference, rank, n_anchors, n_neighbours, budget):
-        """Hypotheses for a spread of anchors and the groups among them that agree."""
+        """Hypotheses for a spread of anchors, the groups that agree, neighbours to begin with."""
         ratio, _, _ = density_ratio_map(*sources.points.T, *reference.points.T, self.shape)
         many, few = np.quantile(ratio, [0.75, 0.25])
         n_source = int(min(MAX_NEIGHBOURS, np.ceil(n_neighbours * max(1.0, many))))
@@ -316,7 +317,7 @@ class Search:
             density=len(reference.points) / area,
             max_difference=limits.max_scale + limits.gradient,
         )
-        return hypotheses, groups
+        return hypotheses, groups, int(min(MAX_NEIGHBOURS, np.ceil(N_NEIGHBOURS * max(1.0, many))))
 
     def anchors(self, sources, rank, n_anchors):
         """Spread anchors over the frame: the brightest (or most central) star of each cell."""
@@ -626,15 +627,22 @@ def _turn_mapping(mapping, turn):
     return fit.mapping
 
 
-def first_pairs(sources, reference, hypotheses):
+def first_pairs(sources, reference, hypotheses, n_neighbours):
     """Yield sets of pairs to start from, the most promising first."""
-    pairs = _neighbour_pairs(sources, reference, hypotheses)
+    pairs = _neighbour_pairs(sources, reference, hypotheses, n_neighbours)
     yield pairs
     if len(hypotheses) > 1:
         agreeing = _agreeing_pairs(sources.points, reference.points, pairs)
         if agreeing is not None:
             yield agreeing
-        yield _neighbour_pairs(sources, reference, hypotheses.take(slice(0, 1)))
+    if len(hypotheses) > 1 or n_neighbours > N_NEIGHBOURS:
+        alone = _neighbour_pairs(sources, reference, hypotheses.take(slice(0, 1)), n_neighbours)
+        yield alone
+        if n_neighbours > N_NEIGHBOURS:
+            # most neighbours are not in the other list: chance has many of them
+            agreeing = _agreeing_pairs(sources.points, reference.points, alone)
+            if agreeing is not None:
+                yield agreeing
 
 
 def _agreeing_pairs(sources, reference, pairs):
@@ -661,9 +669,9 @@ def _agreeing_pairs(sources, reference, pairs):
     return i[keep], j[keep]
 
 
-def _neighbour_pairs(sources, reference, hypotheses):
+def _neighbour_pairs(sources, reference, hypotheses, n_neighbours):
     """First pairs: the stars of a group of hypotheses and neighbours that coincide."""
-    log_d, angle, neighbour = neighbour_pattern(sources.tree, hypotheses.source, N_NEIGHBOURS)
+    log_d, angle, neighbour = neighbour_pattern(sources.tree, hypotheses.source, n_neighbours)
     distance = np.exp(log_d + hypotheses.log_scale[:, None])
     angle = angle + hypotheses.rotation[:, None]
     place = reference.points[hypotheses.reference][:, None, :] + np.stack(
