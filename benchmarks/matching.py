@@ -5,12 +5,15 @@ python benchmarks/matching.py lab --seeds 1 2 3        cases of the lab (see bel
 python benchmarks/matching.py random --n 1000          random solvable cases
 python benchmarks/matching.py impossible --n 1000      cases that must be refused
 python benchmarks/matching.py blind --n 100            mirrored, turned, wrong scale or pointing
-python benchmarks/matching.py times                    1e3 to 1e6 stars; memory
+python benchmarks/matching.py hard --n 100             random cases beyond that range
+python benchmarks/matching.py times                    1e3 to 1e6 stars; memory; peers beside
+python benchmarks/matching.py refusals                 time to refuse a small frame
 python benchmarks/matching.py real                     CFHT/WIRCam frames with a wrong header
 
 The lab (`field.py`, `judge.py`) is looked for in the folder of the environment variable
 WPDC_GWCS_LAB or in ../shared/lab beside the repository, real frames in WPDC_GWCS_DATA or
-../shared/data; what is absent is skipped.  astroalign and SCAMP run beside where installed.
+../shared/data; what is absent is skipped.  astroalign, twirl and SCAMP run beside where installed.
+Seconds are those of the processor as well as of the clock, since other work delays the clock.
 """
 
 import argparse
@@ -149,15 +152,15 @@ def make_case(seed, *, max_stars=10_000):
 
 
 def run_case(case, **options):
-    """Time, pairs and diagnostics of a case; pairs are None where it was refused."""
+    """Processor time, pairs and diagnostics of a case; pairs are None where it was refused."""
     options |= {k: case[k] for k in ("flux", "mag", "x_err", "y_err") if k in case}
     planes = [case[k] for k in ("xs", "ys", "xr", "yr")]
-    began = time.perf_counter()
+    began = time.process_time()
     try:
         i, j, diagnostics = match_planes(*planes, image_shape=case["image_shape"], **options)
     except MatchError as error:
-        return time.perf_counter() - began, None, error
-    return time.perf_counter() - began, (i, j), diagnostics
+        return time.process_time() - began, None, error
+    return time.process_time() - began, (i, j), diagnostics
 
 
 def score(case, pairs):
@@ -166,11 +169,63 @@ def score(case, pairs):
     return right.sum() / max(1, (case["true"] >= 0).sum()), 1 - right.mean()
 
 
-def report_random(n, first, max_stars):
+def make_hard_case(seed):
+    """A case at or beyond the edge of what must be solved: everything goes wrong at once."""
+    kinds = ("large and sparse", "half lost", "clusters", "steep", "noisy")
+    kind = kinds[seed % len(kinds)]
+    rng = np.random.default_rng([seed, 1])
+    nx, ny = (9216, 9216) if kind == "large and sparse" else rng.integers(2048, 9216, 2)
+    per_arcmin = 2.0 if kind == "large and sparse" else np.exp(rng.uniform(np.log(5), np.log(300)))
+    density = min(per_arcmin * (0.074 / 60) ** 2, 8000 / (nx * ny))
+    camera = Camera(rng, (ny, nx), 200.0 if kind != "noisy" else rng.uniform(0, 200))
+    margin = 900
+    n = rng.poisson(density * (nx + 2 * margin) * (ny + 2 * margin))
+    size = np.array([nx, ny]) + 2 * margin
+    points = rng.uniform(size=(n, 2)) * size - margin
+    if kind == "clusters":
+        # two of three stars stand in a few clumps
+        centers = rng.uniform(size=(4, 2)) * [nx, ny]
+        clump = rng.uniform(size=n) < 0.67
+        width = rng.uniform(100, 500, 4)[pick := rng.integers(4, size=n)]
+        points[clump] = (centers[pick] + rng.normal(size=(n, 2)) * width[:, None])[clump]
+    mag = draw_magnitudes(rng, n)
+    x, y = camera.to_detector(*points.T)
+    lost = 0.5 if kind in ("half lost", "large and sparse") else 0.2
+    seen = (x > 0) & (x < nx - 1) & (y > 0) & (y < ny - 1) & (rng.uniform(size=n) > lost)
+    true = np.flatnonzero(seen)
+    sigma = np.interp(mag[true], [20, 25], [0.02, 0.07]) * (10 if kind == "noisy" else 1)
+    extra = len(true) if kind in ("half lost", "steep") else len(true) // 4
+    xs, ys = (
+        np.append(c[true] + rng.normal(size=len(true)) * sigma, rng.uniform(0, side, extra))
+        for c, side in ((x, nx), (y, ny))
+    )
+    angle, scale = np.deg2rad(rng.choice([-1, 1])), 1 + rng.choice([-0.01, 0.01])
+    direction = rng.uniform(0, 2 * np.pi)
+    c, s = scale * np.cos(angle), scale * np.sin(angle)
+    u, v = points[:, 0] - nx / 2, points[:, 1] - ny / 2
+    xr = nx / 2 + c * u - s * v + 30 * ARCSEC * np.cos(direction)
+    yr = ny / 2 + s * u + c * v + 30 * ARCSEC * np.sin(direction)
+    kept = np.arange(n)
+    if kind == "half lost":
+        kept = np.flatnonzero(mag < 22)  # 3 mag shallower
+    new = np.full(n + 1, -1)
+    new[kept] = np.arange(len(kept))
+    case = {
+        "xs": xs, "ys": ys, "xr": xr[kept], "yr": yr[kept], "image_shape": (ny, nx),
+        "true": new[np.append(true, np.full(extra, -1))],
+        "about": f"seed {seed} {kind}, {nx}x{ny} {density * (60 / 0.074) ** 2:.0f}/arcmin2",
+    }  # fmt: skip
+    if rng.uniform() < 0.5:
+        flux = 10 ** (-0.4 * np.append(mag[true], rng.uniform(21, 25, extra)))
+        case |= {"flux": flux, "mag": mag[kept]}
+    return case, rng
+
+
+def report_random(n, first, max_stars, *, make=make_case, name="random"):
     solvable = solved = few = wrong = 0
     lowest, seconds = [], []
     for seed in range(first, first + n):
-        case, _ = make_case(seed, max_stars=max_stars)
+        case, _ = make(seed, max_stars=max_stars) if make is make_case else make(seed)
         common = int((case["true"] >= 0).sum())
         elapsed, pairs, result = run_case(case)
         seconds.append(elapsed)
@@ -189,10 +244,10 @@ def report_random(n, first, max_stars):
                 f"  wrong: {case['about']}, {common} common, recall {recall:.3f} false {false:.3f}"
             )
     print(
-        f"random: {n} cases, {solvable} with >= 30 common stars, {solved} of them solved, "
+        f"{name}: {n} cases, {solvable} with >= 30 common stars, {solved} of them solved, "
         f"{few} refused with fewer; silently wrong {wrong}; "
         f"recall: median {np.median(lowest):.4f}, 1 % {np.quantile(lowest, 0.01):.3f}; "
-        f"{np.mean(seconds):.2f} s each"
+        f"{np.mean(seconds):.2f} s each (processor), longest {np.max(seconds):.1f}"
     )
 
 
@@ -227,7 +282,39 @@ def report_impossible(n, first, max_stars):
         if pairs is not None:
             accepted += 1
             print(f"  accepted: {kind}, {case['about']}: {result.to_dict()}")
-    print(f"impossible: {n} cases, {n - accepted} refused; {np.mean(seconds):.2f} s each")
+    print(
+        f"impossible: {n} cases, {n - accepted} refused; "
+        f"{np.mean(seconds):.2f} s each (processor), longest {np.max(seconds):.1f}"
+    )
+
+
+def report_refusals(n):
+    """Sources and stars that have nothing to do with each other."""
+    print("   frame  sources  reference  brightness  blind  seconds (processor): median  longest")
+    for side, count in ((2048, 500), (2048, 2000), (9216, 500), (9216, 10_000)):
+        for bright in (True, False):
+            for blind in (False, True):
+                seconds = []
+                for seed in range(n):
+                    rng = np.random.default_rng([seed, count, side])
+                    m = int(count * ((side + 1200) / side) ** 2)
+                    case = {
+                        "xs": rng.uniform(0, side, count), "ys": rng.uniform(0, side, count),
+                        "xr": rng.uniform(-600, side + 600, m),
+                        "yr": rng.uniform(-600, side + 600, m),
+                        "image_shape": (side, side),
+                    }  # fmt: skip
+                    if bright:
+                        flux = 10 ** (-0.4 * draw_magnitudes(rng, count))
+                        case |= {"flux": flux, "mag": draw_magnitudes(rng, m)}
+                    elapsed, pairs, _ = run_case(case, blind=blind)
+                    seconds.append(elapsed)
+                    if pairs is not None:
+                        print(f"  accepted: seed {seed}")
+                print(
+                    f"{side:8d} {count:8d} {m:10d}  {'yes' if bright else 'no':10s}  "
+                    f"{'yes' if blind else 'no':5s} {np.median(seconds):28.2f} {max(seconds):8.2f}"
+                )
 
 
 def report_blind(n, first, max_stars):
@@ -269,7 +356,8 @@ def report_blind(n, first, max_stars):
         wrong += false > 0.02
     print(
         f"blind: {n} cases, {refused} refused without, {solved} solved with --blind, "
-        f"{wrong} silently wrong; {np.mean(seconds):.2f} s each"
+        f"{wrong} silently wrong; "
+        f"{np.mean(seconds):.2f} s each (processor), longest {np.max(seconds):.1f}"
     )
 
 
@@ -340,11 +428,17 @@ def report_lab(names, seeds, *, magnitudes=True):
                 f"{r[:, 0].min():11.4f} {r[:, 1].max():10.5f} "
                 f"{r[:, 2].mean():9.0f} {r[:, 3].mean():9.0f} {r[:, 4].max():7.2f}"
             )
-    if shutil.which("scamp"):
-        report_scamp(judge, field)
 
 
-def report_scamp(judge, field):
+def report_scamp():
+    """Time and error of SCAMP and of this package on one field of 8,500 stars."""
+    folder = locate("WPDC_GWCS_LAB", "lab")
+    if folder is None or not shutil.which("scamp"):
+        print("SCAMP: it or the lab is not installed, skipped")
+        return
+    sys.path.insert(0, str(folder))
+    import field
+    import judge
     import scamp
 
     reference, exposures = lab_case(judge, field, "single", 1)
@@ -353,16 +447,36 @@ def report_scamp(judge, field):
         folder = Path(folder)
         scamp.write_sources(folder / "e.cat", truth, found, header)
         scamp.write_reference(folder / "ref.cat", reference)
-        seconds, solved, _ = scamp.run(folder, ["e.cat"], "ref.cat", crossid=16.0)
-    error = judge.grid_error(lambda x, y: solved[0].all_pix2world(x, y, 0), truth)
-    print(f"SCAMP, single: {seconds:.1f} s, no complaint, {np.sqrt((error**2).mean()):.1f} px rms")
+        for degree in (3, 5):
+            seconds, solved, _ = scamp.run(
+                folder, ["e.cat"], "ref.cat", crossid=16.0, degree=degree
+            )
+            error = judge.grid_error(lambda x, y: solved[0].all_pix2world(x, y, 0), truth)  # noqa: B023
+            print(
+                f"SCAMP degree {degree}, case single, {len(found)} sources: {seconds:.1f} s, "
+                f"no complaint, {np.sqrt((error**2).mean()):.2f} px rms off the truth"
+            )
+    began, busy = time.perf_counter(), time.process_time()
+    matches, diagnostics = match_sources(
+        found, reference, WCS(header), image_shape=(truth.ny, truth.nx), epoch=found.meta["epoch"]
+    )
+    seconds, busy = time.perf_counter() - began, time.process_time() - busy
+    ids = np.asarray(reference["source_id"])
+    right = np.asarray(found["true_id"])[matches["source_index"]] == ids[matches["catalog_index"]]
+    print(
+        f"this package, the same: {seconds:.2f} s ({busy:.2f} s processor), {len(matches)} pairs, "
+        f"{np.count_nonzero(~right)} wrong, scatter {diagnostics.scatter:.3f} px"
+    )
 
 
 # Times
 
 
 def report_times(numbers):
-    print("     stars  reference  brightness  seconds  recall   false    GB   astroalign")
+    print(
+        "     stars  reference  brightness  seconds  processor  recall   false    GB   peers: "
+        "seconds, right control points"
+    )
     for n in numbers:
         for bright in (True, False):
             rng = np.random.default_rng(n)
@@ -391,12 +505,16 @@ def report_times(numbers):
             if bright:
                 flux = 10 ** (-0.4 * np.append(mag[true], rng.uniform(21, 25, extra)))
                 case |= {"flux": flux, "mag": mag}
-            seconds, pairs, result = run_case(case)
+            began = time.perf_counter()
+            busy, pairs, result = run_case(case)
+            seconds = time.perf_counter() - began
             memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
             recall, false = score(case, pairs) if pairs else (0.0, 0.0)
-            peer = run_astroalign(case) if bright and n <= 10_000 else ""
+            peer = ""
+            if bright and n <= 10_000:
+                peer = f"astroalign {run_astroalign(case)}; twirl {run_twirl(case)}"
             print(
-                f"{n:10d} {n_ref:10d}  {'yes' if bright else 'no':10s} {seconds:8.2f} "
+                f"{n:10d} {n_ref:10d}  {'yes' if bright else 'no':10s} {seconds:8.2f} {busy:10.2f} "
                 f"{recall:7.4f} {false:8.6f} "
                 f"{memory:5.2f}   {peer}"
             )
@@ -418,12 +536,38 @@ def run_astroalign(case):
     began = time.perf_counter()
     try:
         _, (a, b) = astroalign.find_transform(*points)
-    except (astroalign.MaxIterError, TypeError, ValueError) as error:
-        return f"{time.perf_counter() - began:.2f} s, failed: {error}"
+    except (astroalign.MaxIterError, TypeError, ValueError):
+        return f"{time.perf_counter() - began:.2f} s, failed"
     seconds = time.perf_counter() - began
     i = bright_s[[int(np.argmin(np.hypot(*(points[0] - p).T))) for p in a]]
     j = bright_r[[int(np.argmin(np.hypot(*(points[1] - p).T))) for p in b]]
-    return f"{seconds:.2f} s, {(case['true'][i] == j).sum()} of {len(i)} control points right"
+    return f"{seconds:.2f} s, {(case['true'][i] == j).sum()} of {len(i)}"
+
+
+def run_twirl(case):
+    """Affine transformation from asterisms of bright stars: the pairs it brings within 20 px."""
+    try:
+        from twirl.match import find_transform
+    except ImportError:
+        return "not installed"
+    bright_s, bright_r = np.argsort(-case["flux"])[:15], np.argsort(case["mag"])[:25]
+    points = [
+        np.column_stack([case[x], case[y]])[rows]
+        for x, y, rows in (("xs", "ys", bright_s), ("xr", "yr", bright_r))
+    ]
+    began = time.perf_counter()
+    try:
+        found = find_transform(*points, tolerance=20)
+    except (TypeError, ValueError, np.linalg.LinAlgError):
+        return f"{time.perf_counter() - began:.2f} s, failed"
+    seconds = time.perf_counter() - began
+    if found is None:
+        return f"{seconds:.2f} s, none"
+    mapped = np.column_stack([points[0], np.ones(len(points[0]))]) @ np.asarray(found).T
+    gap = np.hypot(*(mapped[:, None, :2] - points[1][None]).transpose(2, 0, 1))
+    i, near = np.flatnonzero(gap.min(1) < 20), gap.argmin(1)
+    right = case["true"][bright_s[i]] == bright_r[near[i]]
+    return f"{seconds:.2f} s, {right.sum()} of {len(i)}"
 
 
 # Real frames
@@ -487,7 +631,7 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parts = ("lab", "random", "impossible", "blind", "times", "real")
+    parts = ("lab", "random", "hard", "impossible", "blind", "refusals", "times", "real")
     parser.add_argument("part", nargs="*", help=", ".join(parts))
     parser.add_argument("--cases", nargs="+", default=LAB_CASES)
     parser.add_argument("--seeds", nargs="+", type=int, default=[1])
@@ -505,6 +649,11 @@ def main():
             report_lab(a.cases, a.seeds, magnitudes=not a.no_magnitudes)
         elif part == "times":
             report_times([int(n) for n in a.stars])
+            report_scamp()
+        elif part == "refusals":
+            report_refusals(max(3, a.n // 10))
+        elif part == "hard":
+            report_random(a.n, a.first, None, make=make_hard_case, name="hard")
         elif part == "real":
             report_real()
         else:
