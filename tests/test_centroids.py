@@ -5,8 +5,14 @@ from photutils.psf import GriddedPSFModel, ImagePSF, PSFPhotometry, SourceGroupe
 from scipy.special import erf
 
 from wpdc_gwcs import centroids, detection
-from wpdc_gwcs.centroids import _profile, build_epsf, fit_centroids
-from wpdc_gwcs.detection import FLAG_FIT_FAILED, detect_sources, subtract_background
+from wpdc_gwcs.centroids import _profile, build_epsf, fit_centroids, subtract_stars
+from wpdc_gwcs.detection import (
+    FLAG_BLENDED,
+    FLAG_FIT_FAILED,
+    detect_companions,
+    detect_sources,
+    subtract_background,
+)
 from wpdc_gwcs.exceptions import CentroidWarning
 
 SHAPE = (512, 500)
@@ -189,6 +195,60 @@ def test_neighbours_are_taken_off(rng):
     before = np.asarray(once["x"])[index] - allx
     assert np.std(d[np.append(paired, np.ones(len(xn), bool))]) < 0.012
     assert np.std(before) > 1.5 * np.std(d)
+
+
+def test_companions_on_the_flanks_are_found_and_taken_off(rng):
+    x, y = star_grid(rng, 24)
+    flux = 10 ** rng.uniform(4.0, 4.8, x.size)
+    # Every third star has a companion of a tenth of its light, too near for a peak of its own.
+    angle = rng.uniform(0, 2 * np.pi, x.size)
+    pair = np.arange(x.size) % 3 == 0
+    x2, y2 = (x + 2.1 * np.cos(angle))[pair], (y + 2.1 * np.sin(angle))[pair]
+    image = stars_image(SHAPE, x, y, flux) + stars_image(SHAPE, x2, y2, 0.1 * flux[pair])
+    background = subtract_background(observe(image, rng))
+    sources = detect_sources(background, gain=GAIN)
+    epsf = build_epsf(background, sources, gain=GAIN)
+    before = fit_centroids(background, sources, epsf, gain=GAIN)
+    residual = subtract_stars(background, before, epsf, gain=GAIN)
+    more = detect_companions(residual, sources, gain=GAIN)
+    start = more.copy()
+    for name in ("x", "y", "flux"):
+        start[name][: len(before)] = before[name]
+    after = fit_centroids(background, start, epsf, gain=GAIN, refit=True, passes=6)
+
+    def error(table):
+        return np.median(nearest(table, x[pair], y[pair])[1])
+
+    assert np.mean(nearest(before, x2, y2)[1] < 0.5) < 0.2
+    assert np.mean(nearest(after, x2, y2)[1] < 0.5) > 0.85
+    assert error(after) < 0.3 * error(before)
+    assert np.mean(after["flags"][nearest(after, x2, y2)[0]] & FLAG_BLENDED > 0) > 0.85
+    # Stars without companion are where they were.
+    index, _ = nearest(after, x[~pair], y[~pair])
+    assert np.median(np.hypot(after["x"] - start["x"], after["y"] - start["y"])[index]) < 1e-3
+    # The known sources come first, as they were; hardly anything but companions is added.
+    assert np.array_equal(more["x"][: len(sources)], sources["x"])
+    assert more.meta == sources.meta
+    index, distance = nearest(more[len(sources) :], x2, y2)
+    assert len(more) - len(sources) < np.sum(distance < 0.7) + 0.03 * len(x)
+
+
+def test_subtracted_stars_leave_noise(frame):
+    background, result = frame["background"], frame["result"]
+    residual = subtract_stars(background, result, frame["epsf"], gain=GAIN)
+    assert (residual.rms >= background.rms).all()
+    assert np.std(residual.image / residual.rms) == pytest.approx(1, abs=0.05)
+    assert np.abs(residual.image / residual.rms).max() < 7
+    # What has no fit stays where it is.
+    kept = result.copy()
+    kept["chi2"][frame["index"][0]] = np.nan
+    x, y = np.rint(frame["x"][0]).astype(int), np.rint(frame["y"][0]).astype(int)
+    one = subtract_stars(background, kept, frame["epsf"], gain=GAIN)
+    assert one.image[y, x] == pytest.approx(background.image[y, x], rel=1e-3)
+    # Nothing is added to stars that stand alone.
+    assert len(detect_companions(residual, frame["sources"])) <= len(result) + 2
+    with pytest.raises(ValueError, match="threshold must be positive, got 0"):
+        detect_companions(residual, frame["sources"], threshold=0)
 
 
 def test_unknown_gain_is_learnt(frame):

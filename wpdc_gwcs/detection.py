@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import sep
-from astropy.table import Table
+from astropy.table import Table, vstack
 from scipy.spatial import KDTree
 
 from wpdc_gwcs.exceptions import DetectionError
@@ -25,6 +25,7 @@ __all__ = [
     "FLAG_FIT_FAILED",
     "FLAG_SATURATED",
     "Background",
+    "detect_companions",
     "detect_sources",
     "subtract_background",
 ]
@@ -56,6 +57,9 @@ _COLD = 10.0
 # A neighbour's light at the centre of a source, relative to the source's own, from which the fit
 # of both together is no longer as good as that of a single star.
 _MAX_SHARE = 0.15
+
+# Nearest that two sources are told apart, in FWHM.
+_RESOLVED = 0.6
 
 # Rows searched at a time, and their overlap: every source is taken whole, from the strip that holds
 # its peak.
@@ -277,6 +281,70 @@ def detect_sources(
         fwhm,
     )
     return table
+
+
+def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_contrast=0.002):
+    """Add the sources that show once the known ones are subtracted.
+
+    Parameters
+    ----------
+    residual : Background
+        Image without the known sources, and the noise with their models' error, as from
+        `wpdc_gwcs.centroids.subtract_stars`.
+    sources : `~astropy.table.Table`
+        The known sources, from `detect_sources`.
+    threshold, gain, deblend_contrast
+        As for `detect_sources`.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        The known sources, then the new ones; `FLAG_BLENDED` is set anew for all.
+
+    Notes
+    -----
+    A threshold finds no peak on the flank of a brighter star, and the light there moves the centre
+    of that star's fit.  What is nearer than 0.6 FWHM to a known source is not told from an error of
+    the PSF and left alone.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import build_epsf, detect_sources, fit_centroids
+    >>> from wpdc_gwcs.centroids import subtract_stars
+    >>> from wpdc_gwcs.detection import detect_companions, subtract_background
+    >>> rng = np.random.default_rng(1)
+    >>> y, x = np.mgrid[:200, :200]
+    >>> image = rng.normal(100, 5, x.shape)
+    >>> for x0, y0 in 20 * np.mgrid[1:10, 1:10].reshape(2, -1).T + rng.uniform(-2, 2, (81, 2)):
+    ...     image += 3000 * np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / 3)
+    >>> image += 300 * np.exp(-((x - x0 - 2.8) ** 2 + (y - y0) ** 2) / 3)  # beside the last one
+    >>> background = subtract_background(image)
+    >>> sources = detect_sources(background)
+    >>> epsf = build_epsf(background, sources)
+    >>> residual = subtract_stars(background, fit_centroids(background, sources, epsf), epsf)
+    >>> len(sources), len(detect_companions(residual, sources))
+    (81, 82)
+    """
+    if not threshold > 0:
+        raise ValueError(f"threshold must be positive, got {threshold}")
+    found = _extract(residual, threshold, deblend_contrast)
+    fwhm = sources.meta["fwhm"]
+    result = sources.copy()
+    if len(found):
+        new = _measure(residual, found, fwhm, gain, sources.meta["saturation"])
+        distance = KDTree(_places(sources)).query(_places(new))[0]
+        new = new[(distance > _RESOLVED * fwhm) & (new["flags"] & FLAG_SATURATED == 0)]
+        log.info("%d more sources beside those subtracted", len(new))
+        result = vstack([result, new], metadata_conflicts="silent")
+        result.meta.update(sources.meta)
+    blended = _blended(*(np.asarray(result[c], float) for c in ("x", "y", "flux")), fwhm)
+    result["flags"] = result["flags"] & ~FLAG_BLENDED | np.where(blended, FLAG_BLENDED, 0)
+    return result
+
+
+def _places(table):
+    return np.column_stack([table["x"], table["y"]])
 
 
 def _plateau(background):

@@ -17,8 +17,8 @@ from wpdc_gwcs.calibration.start import (
     undistort,
 )
 from wpdc_gwcs.catalogs import propagate, select_cone
-from wpdc_gwcs.centroids import build_epsf, fit_centroids
-from wpdc_gwcs.detection import detect_sources, subtract_background
+from wpdc_gwcs.centroids import build_epsf, fit_centroids, subtract_stars
+from wpdc_gwcs.detection import detect_companions, detect_sources, subtract_background
 from wpdc_gwcs.exceptions import DetectionError, MatchError
 from wpdc_gwcs.matching import match_planes
 
@@ -32,6 +32,9 @@ _MAX_ROUNDNESS = 0.3
 _MIN_SNR = 10.0
 
 _ERROR_FLOOR = 0.01  # px
+
+# Rounds after which close pairs have shared out their light.
+_PASSES_OF_PAIRS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +108,17 @@ def measure_sources(frame, settings=None):
     if settings.centroids == "psf":
         epsf = build_epsf(background, detected, gain=frame.gain)
         if epsf is not None:
-            sources = fit_centroids(background, detected, epsf, gain=frame.gain)
+            fitted = fit_centroids(background, detected, epsf, gain=frame.gain)
+            residual = subtract_stars(background, fitted, epsf, gain=frame.gain)
+            detected = detect_companions(
+                residual, detected, threshold=settings.threshold, gain=frame.gain
+            )
+            start = detected.copy()
+            for name in ("x", "y", "flux"):
+                start[name][: len(fitted)] = fitted[name]
+            sources = fit_centroids(
+                background, start, epsf, gain=frame.gain, refit=True, passes=_PASSES_OF_PAIRS
+            )
     # The fit's own ratio is the greater one, but for sources whose aperture is full of others.
     snr = np.minimum(detected["flux"] / detected["flux_err"], sources["snr"])
     if not np.any(snr > settings.min_snr):

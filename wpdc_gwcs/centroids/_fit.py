@@ -142,6 +142,12 @@ class StarFits:
     chi2: np.ndarray
     valid: np.ndarray
 
+    @classmethod
+    def unfitted(cls, stars):
+        """Start values in the place of fits, for those without a flux none."""
+        n = len(stars.x)
+        return cls(stars, np.full((n, 3, 3), np.nan), np.full(n, np.nan), stars.flux > 0)
+
     def updated(self, rows, other):
         """Return these fits with some rows replaced by those of other fits."""
         columns = []

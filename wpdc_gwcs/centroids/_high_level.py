@@ -17,6 +17,7 @@ from wpdc_gwcs.centroids._build import (
 from wpdc_gwcs.centroids._fit import (
     Field,
     Noise,
+    StarFits,
     Stars,
     estimate_noise,
     fit_stars,
@@ -26,7 +27,7 @@ from wpdc_gwcs.centroids._fit import (
 from wpdc_gwcs.centroids._profile import Profile, moffat_samples, spline_coefficients
 from wpdc_gwcs.exceptions import CentroidWarning
 
-__all__ = ["build_epsf", "fit_centroids"]
+__all__ = ["build_epsf", "fit_centroids", "subtract_stars"]
 
 log = logging.getLogger(__name__)
 
@@ -45,6 +46,8 @@ _TOLERATED_CHI2 = 1.5
 # Light of neighbours, in standard deviations of the sky, that does not matter to a fit.
 _NEGLIGIBLE = 0.05
 _CHUNK = 10_000
+# Error of the PSF, relative, below which a residual is no sign of another star.
+_MODEL_ERROR = 0.1
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
 
@@ -168,7 +171,7 @@ def _learn(field, stars, fwhm, gain, vary):
     return varying if len(stars.x) >= _MIN_STARS else profile
 
 
-def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
+def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3, refit=False):
     r"""Fit an effective PSF to all sources.
 
     Parameters
@@ -185,6 +188,9 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
         Standard deviation of the background; only for a plain array.
     passes : int, optional
         Number of rounds; from the second on, the neighbours' models are subtracted.
+    refit : bool, optional
+        The sources have been fitted before, or found beside such: neighbours are subtracted from
+        the first round on.  A source on the flank of a brighter one needs that.
 
     Returns
     -------
@@ -231,12 +237,46 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3):
     fwhm = _typical_fwhm(sources)
     stars = _stars_of(sources)
     flags, is_round = _flags_and_shape(sources)
-    fits = _fit(field, profile, stars, is_round & (flags == 0), fwhm, gain, passes)
+    fits = _fit(field, profile, stars, is_round & (flags == 0), fwhm, gain, passes, refit)
     return _fitted_table(sources, fits, flags, fwhm)
 
 
 @_one_thread
-def _fit(field, profile, stars, quality, fwhm, gain, passes):
+def subtract_stars(background, sources, epsf, *, gain=None):
+    """Take the models of fitted stars off an image.
+
+    Parameters
+    ----------
+    background : Background
+        Image without background.
+    sources : `~astropy.table.Table`
+        Result of `fit_centroids`; rows without a fit (``chi2`` is NaN) are left in the image.
+    epsf : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
+        Effective PSF.
+    gain : float, optional
+        Electrons per count.
+
+    Returns
+    -------
+    Background
+        The residual image.  Its ``rms`` is that of the background, of the stars' photons and of
+        an error of the PSF by 10 %: what stands out of it is no residual of a known star.
+
+    Examples
+    --------
+    See `wpdc_gwcs.detection.detect_companions`.
+    """
+    profile = _from_photutils(epsf)
+    drawn = np.isfinite(np.asarray(sources["chi2"], dtype=float))
+    model = render(background.image.shape, profile, _stars_of(sources).take(drawn))
+    variance = background.rms.astype(np.float32) ** 2 + (_MODEL_ERROR * model) ** 2
+    if gain is not None:
+        variance += np.maximum(model, 0) / gain
+    return replace(background, image=background.image - model, rms=np.sqrt(variance))
+
+
+@_one_thread
+def _fit(field, profile, stars, quality, fwhm, gain, passes, refit):
     """Fits of all stars; those of good quality tell the noise."""
     radius = _fit_radius(fwhm)
     noise = Noise(0.0 if gain is None else 1 / gain, 0.02)
@@ -246,10 +286,13 @@ def _fit(field, profile, stars, quality, fwhm, gain, passes):
     clean = star_like(fits.stars.flux, fits.chi2, fits.valid)
     noise = estimate_noise(field, profile, noise, fits.stars.take(clean), radius=radius, gain=gain)
     log.info("noise of the fits: %s", noise)
-    fits = fit_stars(field, profile, noise, stars, radius=radius)
-    for _ in range(passes - 1):
+    if refit:
+        fits = StarFits.unfitted(stars)
+    else:
+        fits = fit_stars(field, profile, noise, stars, radius=radius)
+    for k in range(0 if refit else 1, passes):
         model, own = _model_of(field, profile, fits, stars, fwhm)
-        rows = _disturbed(field, model, profile, own, radius)
+        rows = np.arange(len(stars.x)) if k == 0 else _disturbed(field, model, profile, own, radius)
         if len(rows) == 0:
             break
         # In the memory of the model, which is as large as the image.
