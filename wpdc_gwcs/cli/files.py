@@ -172,20 +172,21 @@ def evaluate_command(
         str | None,
         typer.Option(metavar="CAT", help="Reference catalogue of the run, for magnitudes."),
     ] = None,
-    weights: Annotated[
+    no_weights: Annotated[
         bool,
         typer.Option(
-            help="Fit the polynomial anew with each of the five radial weights, without and with a "
-            "table; needs the *.wcs.asdf files."
+            "--no-weights",
+            help="Do not fit the polynomial anew with each of the five radial weights.",
         ),
-    ] = True,
+    ] = False,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
     """Residuals of calibrated frames: clipped moments, d80, scatter; held-out stars apart.
 
-    Then the same for all frames of a detector with each of the five radial weights.
+    Then the same for all frames of a detector with each of the five radial weights, without and
+    with a table, from the *.wcs.asdf files beside the matches.
     """
     from astropy.table import QTable
 
@@ -194,10 +195,12 @@ def evaluate_command(
 
     if plots is not None:
         require_plotting("--plots")
-    frames = [_EvaluatedFrame(path, weights or plots is not None) for path in match_files(paths)]
+    frames = [
+        _EvaluatedFrame(path, not no_weights or plots is not None) for path in match_files(paths)
+    ]
     if catalog is not None:
         _add_magnitudes(frames, catalog)
-    compared = _compare_weights(frames) if weights else {}
+    compared = {} if no_weights else _compare_weights(frames)
     tables = {}
     rows = []
     for frame in frames:
