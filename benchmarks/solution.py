@@ -145,7 +145,7 @@ class TableClock:
     """Time spent choosing and building tables."""
 
     def __init__(self):
-        from wpdc_gwcs.instrument import solver
+        from wpdc_gwcs.instrument import _solver as solver
 
         self.seconds = 0.0
         for name in ("choose_table", "build_lookup_table"):

@@ -10,7 +10,7 @@ from scipy.interpolate import RBFInterpolator
 from wpdc_gwcs import ResidualMap, build_lookup_table
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.lookup import N_FOLDS, TableChoice, choose_table
-from wpdc_gwcs.lookup.smoother import Bins, Spectrum, kernel_matrix, polynomials, smooth_surface
+from wpdc_gwcs.lookup._smoother import Bins, Spectrum, kernel_matrix, polynomials, smooth_surface
 
 SHAPE = (1500, 2048)
 

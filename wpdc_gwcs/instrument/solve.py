@@ -4,8 +4,8 @@ import numpy as np
 
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.fitting import RadialWeight
-from wpdc_gwcs.instrument.pairs import Pairs
-from wpdc_gwcs.instrument.solver import Solver
+from wpdc_gwcs.instrument._pairs import Pairs
+from wpdc_gwcs.instrument._solver import Solver
 
 __all__ = ["solve_instrument"]
 

@@ -6,9 +6,9 @@
     --build_lookup_table--> LookupTable
 """
 
+from wpdc_gwcs.lookup._smoother import TableChoice
 from wpdc_gwcs.lookup.choice import choose_table
 from wpdc_gwcs.lookup.residual_map import N_FOLDS, ResidualMap
-from wpdc_gwcs.lookup.smoother import TableChoice
 from wpdc_gwcs.lookup.table import TableInfo, build_lookup_table
 
 __all__ = [

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from wpdc_gwcs.exceptions import FitError
-from wpdc_gwcs.lookup.smoother import (
+from wpdc_gwcs.lookup._smoother import (
     MAX_DEGREE,
     Bins,
     Spectrum,
@@ -16,7 +16,7 @@ from wpdc_gwcs.lookup.smoother import (
     smooth_surface,
 )
 
-__all__ = ["MIN_STARS_TABLE", "choose_table", "first_choice", "join_bins"]
+__all__ = ["MIN_STARS_TABLE", "best_of", "choose_table", "first_choice", "join_bins"]
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,18 @@ def choose_table(residual_map, *, lut="auto"):
 
 
 def join_bins(residual_map):
-    """Larger bins, on which every setting is tried: a smoother on M bins costs M^3."""
+    """Join bins into larger ones, on which settings are tried: a smoother on M bins costs M^3.
+
+    Parameters
+    ----------
+    residual_map : ResidualMap
+        Residuals of one detector.
+
+    Returns
+    -------
+    ResidualMap
+        The same in bins two to four times as large, with four stars each where there are enough.
+    """
     my, mx = residual_map.shape
     factors = [k for k in (2, 3, 4) if my % k == 0 and mx % k == 0] or [1]
     enough = [k for k in factors if residual_map.n_stars * k * k >= _STARS_PER_BIN * my * mx]
@@ -112,14 +123,40 @@ def _choose(coarse, *, allow_none):
 
 
 def first_choice(bins, spectrum=None):
-    """Reasonable settings at once: one kernel, generalised cross-validation."""
+    """Choose reasonable settings at once: one kernel, generalised cross-validation.
+
+    Parameters
+    ----------
+    bins : Bins
+        Occupied bins.
+    spectrum : Spectrum, optional
+        A kernel diagonalised on them; the quintic if not given.
+
+    Returns
+    -------
+    TableChoice
+        Degree and smoothing of the least score.
+    """
     if spectrum is None:
         spectrum = Spectrum(bins, "quintic", 1.0, 2)
     return best_of(spectrum, bins.value)[0]
 
 
 def best_of(spectrum, value):
-    """Best smoothing of each degree, best first."""
+    """Choose the best smoothing of each degree.
+
+    Parameters
+    ----------
+    spectrum : Spectrum
+        A kernel diagonalised on the bins.
+    value : (M, 2) ndarray
+        Values of the bins, px.
+
+    Returns
+    -------
+    list of TableChoice
+        One for each degree of the polynomial, best first.
+    """
     found = []
     smoothing = spectrum.eigenvalues.max() * _SMOOTHINGS
     degrees = [

@@ -6,9 +6,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline, RBFInterpolator
 
 from wpdc_gwcs.exceptions import FitError
-from wpdc_gwcs.lookup.choice import MIN_STARS_TABLE, choose_table, first_choice, join_bins
-from wpdc_gwcs.lookup.residual_map import N_FOLDS, ResidualMap
-from wpdc_gwcs.lookup.smoother import (
+from wpdc_gwcs.lookup._smoother import (
     Bins,
     TableChoice,
     kernel_matrix,
@@ -16,6 +14,8 @@ from wpdc_gwcs.lookup.smoother import (
     polynomials,
     saddle,
 )
+from wpdc_gwcs.lookup.choice import MIN_STARS_TABLE, choose_table, first_choice, join_bins
+from wpdc_gwcs.lookup.residual_map import N_FOLDS, ResidualMap
 from wpdc_gwcs.models import LookupTable
 
 __all__ = ["TableInfo", "build_lookup_table"]

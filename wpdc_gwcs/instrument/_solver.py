@@ -14,9 +14,9 @@ from wpdc_gwcs.fitting import (
     robust_sigma,
     solve_linear,
 )
-from wpdc_gwcs.instrument.errors import attitude_variance, error_model, pool_linear, worse_scatter
+from wpdc_gwcs.instrument._errors import attitude_variance, error_model, pool_linear, worse_scatter
+from wpdc_gwcs.instrument._pairs import check_coverage
 from wpdc_gwcs.instrument.exposure import ExposureFit, InstrumentResult
-from wpdc_gwcs.instrument.pairs import check_coverage
 from wpdc_gwcs.lookup import N_FOLDS, ResidualMap, build_lookup_table, choose_table
 from wpdc_gwcs.models import PVPolynomial, deproject, project, pv_terms
 from wpdc_gwcs.solution import DistortionSolution
