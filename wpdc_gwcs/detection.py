@@ -293,8 +293,12 @@ def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_co
         `wpdc_gwcs.centroids.subtract_stars`.
     sources : `~astropy.table.Table`
         The known sources, from `detect_sources`.
-    threshold, gain, deblend_contrast
-        As for `detect_sources`.
+    threshold : float, optional
+        Least significance of a source's peak, in standard deviations of the smoothed noise.
+    gain : float, optional
+        Electrons per count.
+    deblend_contrast : float, optional
+        Least share of the flux that makes a peak within a larger source a source of its own.
 
     Returns
     -------
