@@ -194,7 +194,8 @@ class Search:
                 seeds = []
                 for turn in turns:
                     sources = Stars.build(self.turned(turn)[rows_s])
-                    hypotheses, groups, n_near = self.seeds(
+                    n_near, _ = self.neighbourhood(sources, reference, N_NEIGHBOURS)
+                    hypotheses, groups = self.seeds(
                         sources,
                         reference,
                         self.flux_rank(rows_s),
@@ -288,12 +289,18 @@ class Search:
         """Order in which stars are preferred as anchors; None without fluxes."""
         return None if self.flux is None else -self.flux[rows]
 
-    def seeds(self, sources, reference, rank, n_anchors, n_neighbours, budget):
-        """Hypotheses for a spread of anchors, the groups that agree, neighbours to begin with."""
+    def neighbourhood(self, sources, reference, n_neighbours):
+        """Neighbours to look at on either side, for so many in the sparser list."""
         ratio, _, _ = density_ratio_map(*sources.points.T, *reference.points.T, self.shape)
         many, few = np.quantile(ratio, [0.75, 0.25])
-        n_source = int(min(MAX_NEIGHBOURS, np.ceil(n_neighbours * max(1.0, many))))
-        n_reference = int(min(MAX_NEIGHBOURS, np.ceil(n_neighbours * max(1.0, 1 / few))))
+        return tuple(
+            int(min(MAX_NEIGHBOURS, np.ceil(n_neighbours * max(1.0, surplus))))
+            for surplus in (many, 1 / few)
+        )
+
+    def seeds(self, sources, reference, rank, n_anchors, n_neighbours, budget):
+        """Hypotheses for a spread of anchors and the groups among them that agree."""
+        n_source, n_reference = self.neighbourhood(sources, reference, n_neighbours)
         anchors = self.anchors(sources.points, rank, n_anchors)
         distance = np.hypot(*(sources.points[anchors] - self.frame.center).T)
         limits = self.limits
@@ -317,7 +324,7 @@ class Search:
             density=len(reference.points) / area,
             max_difference=limits.max_scale + limits.gradient,
         )
-        return hypotheses, groups, int(min(MAX_NEIGHBOURS, np.ceil(N_NEIGHBOURS * max(1.0, many))))
+        return hypotheses, groups
 
     def anchors(self, sources, rank, n_anchors):
         """Spread anchors over the frame: the brightest (or most central) star of each cell."""
