@@ -275,7 +275,10 @@ class DistortionInverse(Model):
 
 
 class DetectorToSky(Model):
-    """Detector pixels to the sky in one pass: ``distortion | sky``.
+    """Detector pixels to the sky in one pass: ``distortion | sky``, to 1e-7 px.
+
+    Where there is a look-up table, the projection is taken into its cells if it is bicubic there to
+    1e-7 px, as it is but near the poles; otherwise the formulae are evaluated.
 
     Parameters
     ----------

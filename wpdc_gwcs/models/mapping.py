@@ -116,24 +116,23 @@ class PlaneMap:
         a, b : (N,) ndarray
             Their images; NaN outside the grid.
         """
-        a = b = 0.0
+        images = None
         if self.polynomial is not None:
             u, v = x - self.origin[0], y - self.origin[1]
-            a, b = (horner(c, u, v) for c in self.polynomial)
+            images = [horner(c, u, v) for c in self.polynomial]
             if self.radial is not None:
                 r = self._radius(u, v)[2]
-                a += np.polynomial.polynomial.polyval(r, self.radial[0])
-                b += np.polynomial.polynomial.polyval(r, self.radial[1])
+                for image, coefficients in zip(images, self.radial, strict=True):
+                    image += np.polynomial.polynomial.polyval(r, coefficients)
         if self.grid is not None:
             cell, s, t, outside = self.grid.locate(x, y, margin)
-            ga, gb = self.grid.evaluate(cell, s, t)
-            ga += a
-            gb += b
-            a, b = ga, gb
+            values = self.grid.evaluate(cell, s, t)
             if outside is not None:
-                a[outside] = np.nan
-                b[outside] = np.nan
-        return a, b
+                values[:, outside] = np.nan
+            if images is not None:
+                values += images
+            images = values
+        return tuple(images)
 
     def along_rows(self, x):
         """Return a function for the rows of an image, which have much in common.

@@ -4,6 +4,7 @@ import numpy as np
 from astropy.modeling import Model, Parameter
 
 from wpdc_gwcs.models.blocks import evaluate_blocks
+from wpdc_gwcs.models.mapping import PlaneMap
 
 __all__ = ["SkyTangent", "TangentSky", "deproject", "project"]
 
@@ -56,6 +57,12 @@ class _Tangent:
 
     def deproject_radians(self, xi, eta):
         """Plane in radians, which is overwritten, to the sky in degrees."""
+        ra, dec = self.offsets(xi, eta)
+        ra += self.ra0
+        return self.wrap(ra, dec)
+
+    def offsets(self, xi, eta):
+        """Plane in radians, which is overwritten, to RA from RA0 and Dec in degrees."""
         # Axes of the tangent plane's point: toward RA0 in the equator's plane, east, and north.
         ahead = eta * -self.sin0
         ahead += self.cos0
@@ -77,7 +84,11 @@ class _Tangent:
         dec = np.arctan(north, out=north)
         dec *= 180 / np.pi
         ra *= 180 / np.pi
-        ra += self.ra0
+        return ra, dec
+
+    @staticmethod
+    def wrap(ra, dec):
+        """Bring right ascensions, which are overwritten, into the range from 0 to 360 degrees."""
         if ra.size and not (ra.min() >= 0.0 and ra.max() < 360.0):
             np.mod(ra, 360.0, out=ra)
             # A tiny negative angle is rounded up to 360 by the modulus.
@@ -272,18 +283,25 @@ class TangentSky(_Linear):
         return to_sky
 
     def _after(self, plane_map):
-        """Return a map to the tangent plane in radians, the linear part folded in, and the rest.
+        """Return the whole way to the sky as a map, and a function for what is left to do then.
 
-        The map is kept for as long as it is asked for with the same map and the same parameters.
+        The map leads to the sky itself where that is as good, else to the tangent plane in radians.
+        Both are kept for as long as they are asked for with the same map and the same parameters.
         """
         crpix, cd, crval = self.crpix.value, self.cd.value, self.crval.value
-        numbers = np.concatenate([crpix, np.ravel(cd)])
+        numbers = np.concatenate([crpix, np.ravel(cd), crval])
         cache = self._cache
         if cache is None or cache[0] is not plane_map or not np.array_equal(cache[1], numbers):
             matrix = np.radians(cd)
-            cache = (plane_map, numbers, plane_map.transformed(matrix, -matrix @ crpix))
+            to_plane = plane_map.transformed(matrix, -matrix @ crpix)
+            tangent = _Tangent(crval)
+            to_sky = _cells_to_sky(to_plane, tangent, np.sqrt(abs(np.linalg.det(cd))))
+            if to_sky is None:
+                cache = (plane_map, numbers, to_plane, tangent.deproject_radians)
+            else:
+                cache = (plane_map, numbers, to_sky, tangent.wrap)
             self._cache = cache
-        return cache[2], _Tangent(crval).deproject_radians
+        return cache[2:]
 
     def __getstate__(self):
         return {**self.__dict__, "_cache": None}
@@ -292,6 +310,38 @@ class TangentSky(_Linear):
     def inverse(self):
         """The exact inverse (a `SkyTangent`)."""
         return SkyTangent(self.crpix.value, self.cd.value, self.crval.value)
+
+
+# Error allowed where cells lead to the sky (px), and the most cells that are made for it.
+_CELL_TOLERANCE_PX = 1e-7
+_MOST_CELLS = 40_000
+
+
+def _cells_to_sky(to_plane, tangent, scale):
+    """Return a map with the tangent plane taken into the cells of a map, or `None`.
+
+    In a cell of a look-up table the sky is so nearly a plane that the projection, too, is bicubic
+    to some 1e-8 px, and as quick to evaluate as the table alone.  It is not where cells are large
+    or a pole is close; `None` then.
+    """
+    grid = to_plane.grid
+    if grid is None or to_plane.polynomial is not None or grid.nx * grid.ny > _MOST_CELLS:
+        return None
+
+    def function(x, y):
+        ra, dec = tangent.offsets(*to_plane(x, y))
+        ra += tangent.ra0
+        return ra, dec
+
+    cells = grid.interpolate(function)
+    # Where the error of the interpolation is greatest.
+    points = grid.points([0.0, 0.5, 1.0])
+    exact = np.array(function(*points))
+    to_sky = PlaneMap(grid=cells)
+    error = to_sky(*points) - exact
+    error[0] *= np.cos(np.radians(exact[1]))
+    # Written so that NaN counts as too much.
+    return to_sky if np.abs(error).max() <= _CELL_TOLERANCE_PX * scale else None
 
 
 class SkyTangent(_Linear):
