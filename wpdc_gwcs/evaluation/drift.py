@@ -218,14 +218,27 @@ class _Stars:
         )
         if inflation is None:
             inflation = self._inflation(cell, rows, residual, weight, mean, m)
-        x_size, y_size = (n / n_grid for n in self.solution.image_shape[::-1])
-        known = self.solution.covariance(
-            (full % n_grid + 0.5) * x_size - 0.5, (full // n_grid + 0.5) * y_size - 0.5
-        )
-        known = np.array([np.nan_to_num(known[i, i]) for i in range(2)]) * _TABLE_MARGIN**2
+        known = self._known(n_grid)[:, full]
         return _Cells(
             full, count[full], mean[:, full], inflation / total[:, full], known, inflation
         )
+
+    def _known(self, n_grid):
+        """Variances of the means of all cells, (2, cells), that the solution is uncertain by.
+
+        A smoother of p parameters is wrong by its mean variance where it is asked at a point, and
+        by at most the share cells / p of that in the mean over a cell: the squared means of p
+        orthonormal functions over a cell add up to at most the number of cells.
+        """
+        ny, nx = self.solution.image_shape
+        m = 3 * n_grid
+        x, y = np.meshgrid((np.arange(m) + 0.5) * nx / m - 0.5, (np.arange(m) + 0.5) * ny / m - 0.5)
+        covariance = self.solution.covariance(x, y)
+        variance = np.nan_to_num(np.array([covariance[0, 0], covariance[1, 1]]))
+        variance = variance.reshape(2, n_grid, 3, n_grid, 3).mean(axis=(2, 4)).reshape(2, -1)
+        freedom = self.solution.statistics.get("table", {}).get("freedom") or 0.0
+        share = min(1.0, n_grid**2 / freedom) if freedom else 1.0
+        return variance * share * _TABLE_MARGIN**2
 
     def _inflation(self, cell, rows, residual, weight, mean, m):
         """How much more the means of frames scatter than the errors of their stars, at least 1.
