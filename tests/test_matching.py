@@ -215,7 +215,16 @@ def test_mapping_keeps_shape():
         {"noise": 0.0},
         {"noise": 1.0},
     ],
-    ids=["steep", "spurious", "sparse", "deep-reference", "deep-sources", "crowded", "noise-free", "noisy"],
+    ids=[
+        "steep",
+        "spurious",
+        "sparse",
+        "deep-reference",
+        "deep-sources",
+        "crowded",
+        "noise-free",
+        "noisy",
+    ],
 )
 @pytest.mark.parametrize("brightness", [True, False])
 def test_hard_fields(kwargs, brightness):
