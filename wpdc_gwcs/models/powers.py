@@ -91,7 +91,20 @@ def fit_polynomial(points, values, degree):
 
 
 def horner(coefficients, a, b):
-    """Sum of ``coefficients[p, q] a**p b**q`` over ``p + q < n`` by Horner's rule."""
+    """Sum up a polynomial of the plane by Horner's rule.
+
+    Parameters
+    ----------
+    coefficients : (n, n) ndarray
+        ``coefficients[p, q]`` multiplies ``a**p b**q``; those with ``p + q >= n`` are not used.
+    a, b : (N,) ndarray
+        Coordinates.
+
+    Returns
+    -------
+    total : (N,) ndarray
+        The sum.
+    """
     n = len(coefficients)
     total = None
     for p in range(n - 1, -1, -1):
@@ -111,7 +124,20 @@ def horner(coefficients, a, b):
 
 
 def derivative(coefficients, axis):
-    """Coefficients of the derivative by u (axis 0) or v (axis 1)."""
+    """Differentiate a polynomial of the plane.
+
+    Parameters
+    ----------
+    coefficients : (n, n) ndarray
+        ``coefficients[p, q]`` multiplies ``u**p v**q``.
+    axis : int
+        0 for the derivative by u, 1 for that by v.
+
+    Returns
+    -------
+    derivative : (n - 1, n - 1) ndarray
+        Coefficients of the derivative, (1, 1) for n = 1.
+    """
     n = len(coefficients)
     if n == 1:
         return np.zeros((1, 1))
