@@ -389,7 +389,7 @@ def test_head_for_swarp(tmp_path):
     """SWarp resamples an image of its own x (or y): every value says where it was taken from.
 
     It works in single precision: the ramp starts anew every few pixels.  And it inverts PV by a
-    fit, which is why the distortion is small here: at 5 px the fit is off by 6e-6 px at the corners.
+    fit, hence the small distortion: at 5 px the fit is off by 6e-6 px at the corners.
     """
     period = 4
     swarp = next((p for name in ("SWarp", "swarp") if (p := shutil.which(name))), None)

@@ -9,12 +9,12 @@ from multiprocessing import get_context
 
 import numpy as np
 from astropy.table import QTable
-from threadpoolctl import threadpool_limits
 
 from wpdc_gwcs.calibration.detector import solve_detector
 from wpdc_gwcs.calibration.matched import match_frame, measure_sources
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.exceptions import FitError, FrameFailure, WPDCError
+from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["CalibrationRun", "calibrate"]
 
@@ -41,12 +41,7 @@ class CalibrationRun:
     summary: QTable = field(repr=False)
 
 
-# The matrices are small: threads of the linear algebra library gain little on an idle machine, and
-# waiting for each other cost several times the work on a busy one.  Frames run in parallel instead.
-_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
-
-
-@_one_thread
+@one_blas_thread
 def calibrate(
     frames,
     catalog,
@@ -142,7 +137,7 @@ class FailedFrame:
     seconds: float
 
 
-@_one_thread
+@one_blas_thread
 def _match_or_fail(frame, catalog, solution, settings):
     began = time.perf_counter()
     sources = ()

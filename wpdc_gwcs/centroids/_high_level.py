@@ -5,7 +5,6 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from wpdc_gwcs.centroids._build import (
     OVERSAMPLING,
@@ -26,6 +25,7 @@ from wpdc_gwcs.centroids._fit import (
 )
 from wpdc_gwcs.centroids._profile import Profile, moffat_samples, spline_coefficients
 from wpdc_gwcs.exceptions import CentroidWarning
+from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["build_epsf", "fit_centroids", "subtract_stars"]
 
@@ -50,10 +50,6 @@ _CHUNK = 10_000
 _MODEL_ERROR = 0.1
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
-
-# The matrices are small and many: threads of the linear algebra library wait for each other, on a
-# busy machine for several times the work itself.
-_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
 def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0, vary="auto"):
@@ -135,7 +131,7 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
     return None
 
 
-@_one_thread
+@one_blas_thread
 def _learn(field, stars, fwhm, gain, vary):
     """Profile from the stars chosen, or None if the fits fail."""
     half = int(np.clip(np.ceil(3 * fwhm), 6, 20)) + 1
@@ -241,7 +237,7 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3, refit
     return _fitted_table(sources, fits, flags, fwhm)
 
 
-@_one_thread
+@one_blas_thread
 def subtract_stars(background, sources, epsf, *, gain=None):
     """Take the models of fitted stars off an image.
 
@@ -275,7 +271,7 @@ def subtract_stars(background, sources, epsf, *, gain=None):
     return replace(background, image=background.image - model, rms=np.sqrt(variance))
 
 
-@_one_thread
+@one_blas_thread
 def _fit(field, profile, stars, quality, fwhm, gain, passes, refit):
     """Fits of all stars; those of good quality tell the noise."""
     radius = _fit_radius(fwhm)

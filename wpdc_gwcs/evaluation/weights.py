@@ -17,6 +17,7 @@ from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.fitting import RadialWeight, WPDCFitter
 from wpdc_gwcs.lookup import ResidualMap, build_lookup_table
 from wpdc_gwcs.models import PVPolynomial, project
+from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["WeightResult", "compare_weights", "tabulate_weights"]
 
@@ -49,6 +50,7 @@ class WeightResult:
     held_out: bool
 
 
+@one_blas_thread
 def compare_weights(calibrations, *, weights=RadialWeight.names, r0=None, degree=3):
     """Fit the polynomial, and a table, anew with each of the radial weights.
 

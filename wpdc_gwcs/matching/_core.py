@@ -3,12 +3,12 @@
 import time
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._mapping import MAX_ORDER, SmoothMap
 from wpdc_gwcs.matching._search import MIN_STARS, Limits, Search, Stars
+from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["match_planes", "prepare_search"]
 
@@ -18,12 +18,8 @@ __all__ = ["match_planes", "prepare_search"]
 _MAX_DISTORTION = 250.0
 _MAX_DISTORTION_SHARE = 0.12
 
-# The fits are small and many: threads for linear algebra would wait for each other a thousand times
-# longer than they work as soon as another process is busy.
-_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 
-
-@_one_thread
+@one_blas_thread
 def match_planes(
     xs,
     ys,
