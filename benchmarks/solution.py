@@ -119,7 +119,10 @@ def pulls(exposures, result, chosen):
         # A star of the fit has drawn the map towards itself.
         sign = np.where(fit.used, -1.0, 1.0)
         for residual, error, sigma in ((fit.dx, fit.x_err, sigma_x), (fit.dy, fit.y_err, sigma_y)):
-            values.append((residual / np.sqrt(error**2 + sign * sigma**2))[pick])
+            variance = error**2 + sign * sigma**2
+            # Where a few stars make the map, their residuals say nothing.
+            predicted = np.sqrt(np.where(variance > 0, variance, np.nan))
+            values.append((residual / predicted)[pick])
     values = np.concatenate(values)
     return float(np.std(values[np.abs(values) < 5]))
 
