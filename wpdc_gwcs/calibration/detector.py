@@ -259,6 +259,10 @@ def _calibration(frame, pairs, fit, instrument, settings, holdout, seconds, stor
             "holdout": held,
         }
     )
+    # Not of use here, but to see whether residuals depend on them.
+    for table, name in ((src, "snr"), (ref, "phot_g_mean_mag")):
+        if name in table.colnames:
+            matches[name] = optional_column(table, name)
     check_solution(frame, matches, instrument, stored=stored)
     residuals = evaluate(fit.dx[fit.used], fit.dy[fit.used])
     scale = np.sqrt(abs(np.linalg.det(fit.cd))) * 3.6e6

@@ -168,10 +168,6 @@ def evaluate_command(
         Path | None,
         typer.Option(metavar="DIR", help="Also write figures of the residuals into this folder."),
     ] = None,
-    catalog: Annotated[
-        str | None,
-        typer.Option(metavar="CAT", help="Reference catalogue of the run, for magnitudes."),
-    ] = None,
     no_weights: Annotated[
         bool,
         typer.Option(
@@ -198,8 +194,6 @@ def evaluate_command(
     frames = [
         _EvaluatedFrame(path, not no_weights or plots is not None) for path in match_files(paths)
     ]
-    if catalog is not None:
-        _add_magnitudes(frames, catalog)
     compared = {} if no_weights else _compare_weights(frames)
     tables = {}
     rows = []
@@ -243,7 +237,7 @@ class _EvaluatedFrame:
     """Matches of a frame, and its calibration where that is beside them."""
 
     def __init__(self, path, with_calibration):
-        from wpdc_gwcs.io import read, read_matches, read_table
+        from wpdc_gwcs.io import read, read_matches
 
         self.name = path.name.removesuffix(".matches.ecsv")
         self.matches = read_matches(path)
@@ -251,33 +245,9 @@ class _EvaluatedFrame:
         self.calibration = None
         if with_calibration and beside.exists():
             self.calibration = replace(read(beside), matches=self.matches)
-        sources = path.with_name(f"{self.name}.sources.ecsv")
-        if "snr" not in self.matches.colnames and sources.exists():
-            rows = np.asarray(self.matches["source_index"])
-            self.matches["snr"] = np.asarray(read_table(sources, columns=("snr",))["snr"])[rows]
 
     def flag(self, name):
         return np.asarray(self.matches[name], bool)
-
-
-def _add_magnitudes(frames, catalog):
-    from wpdc_gwcs.catalogs import read_catalog
-
-    reference = read_catalog(catalog)
-    if "phot_g_mean_mag" not in reference.colnames:
-        raise InputError(f"{catalog}: the catalogue has no magnitudes (phot_g_mean_mag)")
-    # Rows that could not be used are not in the catalogue as it was read.
-    rows = np.asarray(reference["catalog_index"])
-    magnitude = np.full(int(rows.max()) + 1, np.nan)
-    magnitude[rows] = np.asarray(reference["phot_g_mean_mag"], float)
-    for frame in frames:
-        index = np.asarray(frame.matches["catalog_index"])
-        if index.max(initial=0) >= len(magnitude):
-            raise InputError(
-                f"{catalog}: {frame.name} refers to row {index.max()}, the catalogue has "
-                f"{len(magnitude)}: it is another one"
-            )
-        frame.matches["phot_g_mean_mag"] = magnitude[index]
 
 
 def _compare_weights(frames):
