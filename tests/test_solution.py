@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
 from wpdc_gwcs import Calibration, DistortionSolution, LookupTable, PVPolynomial
@@ -41,6 +42,16 @@ def test_wcs_of_both(with_table):
     assert_allclose(with_table.wcs(999.5, 499.5), (10.0, 20.0))
     assert_allclose(frame(with_table).wcs(999.5, 499.5), (11.0, 21.0))
     assert with_table.wcs is with_table.wcs
+
+
+def test_undistorted_pixels_are_those_of_the_linear_wcs(with_table):
+    x, y = np.array([3.0, 500.0, 1000.0]), np.array([990.0, 7.0, 500.0])
+    linear = WCS(naxis=2)
+    linear.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    linear.wcs.crpix = np.asarray(with_table.crpix) + 1
+    linear.wcs.cd, linear.wcs.crval = with_table.cd, with_table.crval
+    expected = linear.all_world2pix(*with_table.wcs(x, y), 0)
+    assert_allclose(with_table.undistort(x, y), expected, rtol=0, atol=1e-6)
 
 
 def test_attitude_and_table_add_up(with_table):

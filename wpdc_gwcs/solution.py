@@ -75,6 +75,21 @@ class DistortionSolution:
             image_shape=self.image_shape,
         )
 
+    def undistort(self, x, y):
+        """Take the distortion off detector pixels.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Detector pixels, zero based.
+
+        Returns
+        -------
+        x, y : ndarray
+            Undistorted pixels; NaN off the detector.
+        """
+        return self.wcs.get_transform("detector", "undistorted")(x, y)
+
     def covariance(self, x, y):
         """Covariance of the distortion that the instrument predicts, apart from its linear part.
 

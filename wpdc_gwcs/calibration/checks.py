@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from wpdc_gwcs.calibration.start import undistort
 from wpdc_gwcs.evaluation import binned_residuals, evaluate
 from wpdc_gwcs.exceptions import FitError
 
@@ -65,7 +64,7 @@ def check_solution(frame, matches, instrument, *, stored=None):
         )
     ny, nx = frame.image_shape
     x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, 33), np.linspace(-0.5, ny - 0.5, 33))
-    ux, uy = undistort(instrument, x, y)
+    ux, uy = instrument.undistort(x, y)
     area = np.gradient(ux, axis=1) * np.gradient(uy, axis=0)
     area -= np.gradient(ux, axis=0) * np.gradient(uy, axis=1)
     area /= (nx / 32) * (ny / 32)

@@ -14,7 +14,6 @@ from wpdc_gwcs.calibration.start import (
     LinearWCS,
     detector_center,
     header_reference_point,
-    undistort,
 )
 from wpdc_gwcs.evaluation import evaluate
 from wpdc_gwcs.exceptions import FitError
@@ -208,7 +207,7 @@ def _rematch(frame, solution, fit):
         solution = replace(solution, pv=fit.pv)
     pick = np.flatnonzero(frame.usable)
     src = frame.sources[pick]
-    xs, ys = undistort(solution, np.asarray(src["x"], float), np.asarray(src["y"], float))
+    xs, ys = solution.undistort(np.asarray(src["x"], float), np.asarray(src["y"], float))
     attitude = LinearWCS(crpix=solution.crpix, cd=fit.cd, crval=fit.crval)
     xr, yr = attitude.pixels(frame.reference["ra"], frame.reference["dec"])
     # The errors of the pairs say how far apart a star and its source can be.

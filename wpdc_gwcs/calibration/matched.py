@@ -14,7 +14,6 @@ from wpdc_gwcs.calibration.start import (
     header_reference_point,
     linear_wcs,
     sky_of,
-    undistort,
 )
 from wpdc_gwcs.catalogs import propagate, select_cone
 from wpdc_gwcs.centroids import build_epsf, fit_centroids, subtract_stars
@@ -167,7 +166,7 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
         xs, ys = start.pixels(*sky_of(frame.wcs, x, y))
     else:
         start = linear_wcs(frame.wcs, solution.crpix)
-        xs, ys = undistort(solution, x, y)
+        xs, ys = solution.undistort(x, y)
     reference = _reference_in_reach(frame, catalog, start, settings)
     xr, yr = start.pixels(np.asarray(reference["ra"]), np.asarray(reference["dec"]))
     pick = np.flatnonzero(usable & np.isfinite(xs) & np.isfinite(ys))

@@ -12,7 +12,6 @@ __all__ = [
     "header_reference_point",
     "linear_wcs",
     "sky_of",
-    "undistort",
 ]
 
 
@@ -136,21 +135,3 @@ def linear_wcs(wcs, crpix):
     xi, eta = project(*sky_of(wcs, x, y), crval)
     cd = 0.5 * np.array([[xi[0] - xi[1], xi[2] - xi[3]], [eta[0] - eta[1], eta[2] - eta[3]]])
     return LinearWCS(crpix=crpix, cd=cd, crval=crval)
-
-
-def undistort(solution, x, y):
-    """Take the distortion of an instrument off detector pixels.
-
-    Parameters
-    ----------
-    solution : DistortionSolution
-        The instrument.
-    x, y : array_like
-        Detector pixels, zero based.
-
-    Returns
-    -------
-    x, y : ndarray
-        Undistorted pixels; NaN off the detector.
-    """
-    return solution.wcs.get_transform("detector", "undistorted")(x, y)
