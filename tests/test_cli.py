@@ -202,7 +202,10 @@ def test_options_come_from_preset_then_config_then_command_line(inputs, tmp_path
 
 def test_interrupted_run_leaves_no_half_written_file(inputs, tmp_path):
     frames, reference = inputs
-    command = [sys.executable, "-c", "from wpdc_gwcs.cli import main; main()", "calibrate"]
+    # A shell starts what runs in its background with interrupts ignored, and children inherit that.
+    listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program = f"{listen}; from wpdc_gwcs.cli import main; main()"
+    command = [sys.executable, "-c", program, "calibrate"]
     log = tmp_path / "log"
     with log.open("w") as stderr:
         process = subprocess.Popen(
