@@ -12,6 +12,7 @@ from wpdc_gwcs.calibration import Settings, calibrate, match_frame, measure_sour
 from wpdc_gwcs.calibration.checks import check_solution
 from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs
 from wpdc_gwcs.catalogs import read_catalog
+from wpdc_gwcs.detection import detect_sources
 from wpdc_gwcs.exceptions import DetectionError, FitError, MatchError
 from wpdc_gwcs.simulation import simulate
 
@@ -176,6 +177,8 @@ def test_sources_of_an_image_reach_the_least_signal_to_noise_ratio(simulation):
     exposure = simulation.exposures[0]
     frame = exposure.frame(image=True)
     every, good, better = (measure_sources(frame, Settings(min_snr=limit)) for limit in (0, 10, 30))
+    detected = detect_sources(frame.load_image(), gain=frame.gain, saturation=frame.saturation)
+    assert len(every) >= len(detected)
     assert len(every) > len(good) > len(better) > 100
     assert every["snr"].min() < 10
     # The deeper list holds the same measurements: faint stars are still fitted with the others.

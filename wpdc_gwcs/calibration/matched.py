@@ -105,19 +105,9 @@ def measure_sources(frame, settings=None):
     )
     sources = detected
     if settings.centroids == "psf":
-        epsf = build_epsf(background, detected, gain=frame.gain)
-        if epsf is not None:
-            fitted = fit_centroids(background, detected, epsf, gain=frame.gain)
-            residual = subtract_stars(background, fitted, epsf, gain=frame.gain)
-            detected = detect_companions(
-                residual, detected, threshold=settings.threshold, gain=frame.gain
-            )
-            start = detected.copy()
-            for name in ("x", "y", "flux"):
-                start[name][: len(fitted)] = fitted[name]
-            sources = fit_centroids(
-                background, start, epsf, gain=frame.gain, refit=True, passes=_PASSES_OF_PAIRS
-            )
+        detected, sources = _fit_psf(background, detected, frame.gain, settings.threshold)
+    if settings.min_snr == 0:
+        return sources
     # The fit's own ratio is the greater one, but for sources whose aperture is full of others.
     snr = np.minimum(detected["flux"] / detected["flux_err"], sources["snr"])
     if not np.any(snr > settings.min_snr):
@@ -126,6 +116,26 @@ def measure_sources(frame, settings=None):
             f"{settings.min_snr:g}"
         )
     return sources[snr > settings.min_snr]
+
+
+def _fit_psf(background, detected, gain, threshold):
+    """Fit the PSF to all sources and to what shows once they are subtracted.
+
+    Returns the sources as they were detected, companions included, and as they were fitted; both
+    are the same where no PSF could be built.
+    """
+    epsf = build_epsf(background, detected, gain=gain)
+    if epsf is None:
+        return detected, detected
+    fitted = fit_centroids(background, detected, epsf, gain=gain)
+    residual = subtract_stars(background, fitted, epsf, gain=gain)
+    detected = detect_companions(residual, detected, threshold=threshold, gain=gain)
+    start = detected.copy()
+    for name in ("x", "y", "flux"):
+        start[name][: len(fitted)] = fitted[name]
+    return detected, fit_centroids(
+        background, start, epsf, gain=gain, refit=True, passes=_PASSES_OF_PAIRS
+    )
 
 
 def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
