@@ -16,6 +16,7 @@ from wpdc_gwcs.evaluation.residuals import ResidualStatistics, evaluate
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.fitting import RadialWeight, WPDCFitter
 from wpdc_gwcs.lookup import ResidualMap, build_lookup_table
+from wpdc_gwcs.lookup.choice import first_choices
 from wpdc_gwcs.models import PVPolynomial, project
 from wpdc_gwcs.threads import one_blas_thread
 
@@ -124,9 +125,9 @@ def compare_weights(calibrations, *, weights=RadialWeight.names, r0=None, degree
     if r0 is None:
         r0 = solution.settings.get("r0") or RadialWeight.for_shape(solution.image_shape).r0
     shown = held if held.any() else used
-    cd, results = solution.cd, []
-    for name in weights:
-        weight = RadialWeight(name, r0=float(r0))
+    cd, residuals, maps = solution.cd, [], []
+    weights = [RadialWeight(name, r0=float(r0)) for name in weights]
+    for weight in weights:
         fitter = WPDCFitter(weight=weight, pixel_scale=cd)
         try:
             pv = fitter(
@@ -136,13 +137,18 @@ def compare_weights(calibrations, *, weights=RadialWeight.names, r0=None, degree
                 weights=1.0 / np.sqrt(cd**2 @ sigma[:, used] ** 2),
             )
         except FitError as err:
-            raise FitError(f"weight {name} with r0 = {r0:.6g} px: {err}") from err
+            raise FitError(f"weight {weight.name} with r0 = {r0:.6g} px: {err}") from err
         residual = np.linalg.solve(cd, np.array(pv(*(cd @ offset)))) - reference
-        bins = ResidualMap.from_residuals(
-            *place[:, used], *residual[:, used], x_err=sigma[0, used], y_err=sigma[1, used],
-            image_shape=solution.image_shape, fold=fold[used],
+        residuals.append(residual)
+        maps.append(
+            ResidualMap.from_residuals(
+                *place[:, used], *residual[:, used], x_err=sigma[0, used], y_err=sigma[1, used],
+                image_shape=solution.image_shape, fold=fold[used],
+            )
         )  # fmt: skip
-        table, _ = build_lookup_table(bins, draft=True)
+    results = []
+    for weight, residual, bins, choice in zip(weights, residuals, maps, first_choices(maps)):
+        table, _ = build_lookup_table(bins, choice=choice, draft=True)
         left = residual if table is None else residual - np.array(table(*place))
         results.append(
             WeightResult(

@@ -22,6 +22,7 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.files import READ_ERRORS, file_kind, first_line, open_fits, split_extension
 from wpdc_gwcs.models import PVPolynomial, pv_terms
+from wpdc_gwcs.models.powers import expand_pv
 
 __all__ = [
     "TanHeader",
@@ -471,8 +472,6 @@ def fold_attitude(pv, matrix):
     FileFormatError
         If there are radial terms and A does more than turn, mirror and scale.
     """
-    from wpdc_gwcs.models.powers import expand_pv
-
     matrix = np.asarray(matrix, float)
     if np.array_equal(matrix, np.eye(2)):
         return pv

@@ -16,7 +16,14 @@ from wpdc_gwcs.lookup._smoother import (
     smooth_surface,
 )
 
-__all__ = ["MIN_STARS_TABLE", "best_of", "choose_table", "first_choice", "join_bins"]
+__all__ = [
+    "MIN_STARS_TABLE",
+    "best_of",
+    "choose_table",
+    "first_choice",
+    "first_choices",
+    "join_bins",
+]
 
 log = logging.getLogger(__name__)
 
@@ -140,6 +147,32 @@ def first_choice(bins, spectrum=None):
     if spectrum is None:
         spectrum = Spectrum(bins, "quintic", 1.0, 2)
     return best_of(spectrum, bins.value)[0]
+
+
+def first_choices(residual_maps):
+    """Choose reasonable settings for several maps of the same stars at once.
+
+    Parameters
+    ----------
+    residual_maps : sequence of ResidualMap
+        Other residuals of the same stars in each.  Their bins, and so the kernel diagonalised on
+        them, which is what a choice costs, are common to all.
+
+    Returns
+    -------
+    list of TableChoice
+        What `first_choice` finds for each; no table where there are too few stars.
+    """
+    found, spectrum = [], None
+    for residual_map in residual_maps:
+        if residual_map.n_stars < MIN_STARS_TABLE:
+            found.append(TableChoice("none"))
+            continue
+        bins = Bins(join_bins(residual_map))
+        if spectrum is None:
+            spectrum = Spectrum(bins, "quintic", 1.0, 2)
+        found.append(first_choice(bins, spectrum))
+    return found
 
 
 def best_of(spectrum, value):

@@ -202,8 +202,7 @@ class PlaneMap:
         derivatives : (a_x, a_y, b_x, b_y)
             Their derivatives by x and y.
         """
-        values = [np.zeros_like(x), np.zeros_like(x)]
-        derivatives = [np.zeros_like(x) for _ in range(4)]
+        values = derivatives = None
         if self.polynomial is not None:
             u, v = x - self.origin[0], y - self.origin[1]
             values = [horner(c, u, v) for c in self.polynomial]
@@ -225,11 +224,13 @@ class PlaneMap:
         if self.grid is not None:
             cell, s, t, outside = self.grid.locate(x, y, margin)
             grid_values, grid_derivatives = self.grid.evaluate_jacobian(cell, s, t)
-            values = [g + v for g, v in zip(grid_values, values, strict=True)]
-            derivatives = [g + d for g, d in zip(grid_derivatives, derivatives, strict=True)]
-            if outside is not None:
-                for value in (*values, *derivatives):
-                    value[outside] = np.nan
+            for own, other in ((grid_values, values), (grid_derivatives, derivatives)):
+                for k, value in enumerate(own):
+                    if outside is not None:
+                        value[outside] = np.nan
+                    if other is not None:
+                        value += other[k]
+            values, derivatives = grid_values, grid_derivatives
         return values, derivatives
 
     def invert(self, a, b, *, tolerance, margin=_RIM, start=None):
