@@ -12,9 +12,11 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import (
     Config,
+    MinSNR,
     Overwrite,
     Preset,
     Quiet,
+    Threshold,
     Verbose,
     require_plotting,
 )
@@ -111,16 +113,8 @@ def calibrate_command(
             help="Tangent point and origin of the polynomial; the centre if off the detector.",
         ),
     ] = "header",
-    threshold: Annotated[
-        float,
-        typer.Option(metavar="SIGMA", help="Detection threshold over the background noise."),
-    ] = 5.0,
-    min_snr: Annotated[
-        float,
-        typer.Option(
-            metavar="RATIO", help="Least signal-to-noise ratio of a source kept; 0 keeps all."
-        ),
-    ] = 10.0,
+    threshold: Threshold = 5.0,
+    min_snr: MinSNR = 10.0,
     blind: Annotated[
         bool,
         typer.Option(

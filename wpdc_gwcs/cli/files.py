@@ -194,7 +194,14 @@ def evaluate_command(
     frames = [
         _EvaluatedFrame(path, not no_weights or plots is not None) for path in match_files(paths)
     ]
-    compared = {} if no_weights else _compare_weights(frames)
+    compares = not no_weights and any(frame.calibration is not None for frame in frames)
+    if output is not None:
+        files = {"frames": output}
+        if compares:
+            files["weights"] = output.with_suffix(".weights" + output.suffix)
+        for file in files.values():
+            require_free(file, overwrite)
+    compared = _compare_weights(frames) if compares else {}
     tables = {}
     rows = []
     for frame in frames:
@@ -208,11 +215,6 @@ def evaluate_command(
     if plots is not None:
         _write_plots(frames, compared, plots, overwrite=overwrite)
     if output is not None:
-        files = {
-            "frames": output, "weights": output.with_suffix(".weights" + output.suffix)
-        }  # fmt: skip
-        for name in tables:
-            require_free(files[name], overwrite)
         for name, table in tables.items():
             write_table(table, files[name], overwrite=overwrite)
     if not quiet and output is None:

@@ -11,7 +11,17 @@ import typer
 from wpdc_gwcs.cli.app import set_verbosity
 from wpdc_gwcs.exceptions import InputError
 
-__all__ = ["Config", "Overwrite", "Preset", "Quiet", "Verbose", "require_free", "require_plotting"]
+__all__ = [
+    "Config",
+    "MinSNR",
+    "Overwrite",
+    "Preset",
+    "Quiet",
+    "Threshold",
+    "Verbose",
+    "require_free",
+    "require_plotting",
+]
 
 
 def preset_names():
@@ -104,6 +114,18 @@ Config = Annotated[
         is_eager=True,
     ),
 ]
+Threshold = Annotated[
+    float,
+    typer.Option(metavar="SIGMA", help="Detection threshold over the background noise."),
+]
+
+MinSNR = Annotated[
+    float,
+    typer.Option(
+        metavar="RATIO", help="Least signal-to-noise ratio of a source kept; 0 keeps all."
+    ),
+]
+
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that are already there.")
 ]

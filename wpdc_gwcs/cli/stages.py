@@ -7,7 +7,7 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.calibrate import Catalog, WcsFile
-from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free
+from wpdc_gwcs.cli.options import MinSNR, Overwrite, Quiet, Threshold, Verbose, require_free
 from wpdc_gwcs.exceptions import InputError
 
 Table = Annotated[Path, typer.Option("--output", metavar="FILE", help="Table to write (ECSV).")]
@@ -44,15 +44,8 @@ def detect_command(
     centroids: Annotated[
         str, typer.Option(metavar="{psf,windowed}", help="How positions are measured.")
     ] = "psf",
-    threshold: Annotated[
-        float, typer.Option(metavar="SIGMA", help="Detection threshold over the background noise.")
-    ] = 5.0,
-    min_snr: Annotated[
-        float,
-        typer.Option(
-            metavar="RATIO", help="Least signal-to-noise ratio of a source kept; 0 keeps all."
-        ),
-    ] = 10.0,
+    threshold: Threshold = 5.0,
+    min_snr: MinSNR = 10.0,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
