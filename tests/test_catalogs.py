@@ -130,6 +130,53 @@ def test_skycoord():
     assert len(read_catalog(SkyCoord(1.0, 2.0, unit="deg"))) == 1
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("bp_rp", "ra_dec_corr", "ra_pmra_corr", "dec_pmdec_corr", "parallax_error"),
+        ("BP-RP", "RADEcor", "RApmRAcor", "DEpmDEcor", "e_Plx"),
+    ],
+)
+def test_colors_and_correlations(tmp_path, names):
+    rows = Table(np.arange(10.0).reshape(2, 5) / 10, names=names)
+    rows["ra"], rows["dec"] = [10.0, 10.1], [5.0, 5.1]
+    rows[names[0]][1] = np.nan
+    rows.write(tmp_path / "a.fits")
+    catalog = read_catalog(tmp_path / "a.fits")
+    np.testing.assert_array_equal(catalog["bp_rp"], [0.0, np.nan])
+    assert catalog["bp_rp"].unit == u.mag
+    assert catalog["parallax_error"].unit == u.mas
+    for column, name in zip(
+        ("ra_dec_corr", "ra_pmra_corr", "dec_pmdec_corr", "parallax_error"), names[1:], strict=True
+    ):
+        np.testing.assert_array_equal(catalog[column], rows[name])
+    # Nothing is lost on the way to the frame, nor by reading again.
+    kept = read_catalog(select_cone(propagate(catalog, 2020.0), 10.0, 5.0, 0.01))
+    assert kept["bp_rp"].tolist() == [0.0]
+    assert kept["ra_dec_corr"].tolist() == [0.1]
+
+
+@pytest.mark.parametrize(
+    "bands", [("phot_bp_mean_mag", "phot_rp_mean_mag"), ("BPmag", "RPmag"), ("bp_mag", "rp_mag")]
+)
+def test_color_from_two_bands(bands):
+    table = Table({"ra": [1.0, 2.0, 3.0], "dec": [0.0, 0.0, 0.0]})
+    table[bands[0]] = MaskedColumn([15.5, 16.0, 17.0], mask=[False, True, False])
+    table[bands[1]] = [14.0, 15.0, 15.0]
+    np.testing.assert_array_equal(read_catalog(table)["bp_rp"], [1.5, np.nan, 2.0])
+    # A color of the catalogue's own comes first, star by star.
+    table["bp_rp"] = [1.25, 0.5, np.nan]
+    np.testing.assert_array_equal(read_catalog(table)["bp_rp"], [1.25, 0.5, 2.0])
+    table.remove_columns(["bp_rp", bands[0]])
+    assert "bp_rp" not in read_catalog(table).colnames
+
+
+def test_correlations_are_numbers():
+    table = Table({"ra": [1.0], "dec": [2.0], "ra_dec_corr": [0.5] * u.mas})
+    with pytest.raises(CatalogError, match="unit of column 'ra_dec_corr' must be none, got 'mas'"):
+        read_catalog(table)
+
+
 def ldac_reference(path, epoch=True):
     header = "SIMPLE  =                    T".ljust(80) + "END".ljust(80)
     head = fits.BinTableHDU.from_columns(

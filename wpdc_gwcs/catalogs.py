@@ -8,17 +8,22 @@
 The checked table has plain float64 columns with fixed names and units, whatever the input called
 them:
 
-=================== ======== ==========================================================
-column              unit     meaning
-=================== ======== ==========================================================
-``ra``, ``dec``     deg      ICRS position at ``ref_epoch``
-``pmra``, ``pmdec`` mas / yr proper motion (``pmra`` includes cos Dec), NaN where unknown
-``parallax``        mas      NaN where unknown
-``ref_epoch``       yr       Julian year of the position
-``phot_g_mean_mag`` mag      a brightness, for ordering only
-``ra_error``, ...   mas      errors of ``ra`` (times cos Dec), ``dec``, ``pmra``, ``pmdec``
-``catalog_index``   --       row of the input, zero based
-=================== ======== ==========================================================
+==================== ======== ==================================================================
+column               unit     meaning
+==================== ======== ==================================================================
+``ra``, ``dec``      deg      ICRS position at ``ref_epoch``
+``pmra``, ``pmdec``  mas / yr proper motion (``pmra`` includes cos Dec), NaN where unknown
+``parallax``         mas      NaN where unknown
+``ref_epoch``        yr       Julian year of the position
+``phot_g_mean_mag``  mag      a brightness, for ordering only
+``bp_rp``            mag      a color, NaN where unknown
+``ra_error``, ...    mas      errors of ``ra`` (times cos Dec), ``dec``, ``pmra``, ``pmdec``,
+                              ``parallax``; NaN where unknown
+``ra_pmra_corr``     --       correlation of the errors of ``ra`` and ``pmra``; likewise
+                              ``dec_pmdec_corr``
+``ra_dec_corr``      --       correlation of the errors of ``ra`` and ``dec``
+``catalog_index``    --       row of the input, zero based
+==================== ======== ==================================================================
 """
 
 import re
@@ -61,6 +66,7 @@ _POSITIONS = (
     ("alpha", "delta"),
 )
 
+_NUMBER = u.dimensionless_unscaled
 # Output column -> (unit, aliases best first, unit where the file gives none).
 _OPTIONAL = {
     "pmra": (
@@ -78,6 +84,10 @@ _OPTIONAL = {
     "dec_error": (u.mas, ("dec_error", "e_de_icrs", "e_dej2000", "e_dec", "e_de"), u.mas),
     "pmra_error": (u.mas / u.yr, ("pmra_error", "e_pmra"), u.mas / u.yr),
     "pmdec_error": (u.mas / u.yr, ("pmdec_error", "e_pmdec", "e_pmde"), u.mas / u.yr),
+    "parallax_error": (u.mas, ("parallax_error", "e_plx", "e_parallax"), u.mas),
+    "ra_dec_corr": (_NUMBER, ("ra_dec_corr", "radecor"), _NUMBER),
+    "ra_pmra_corr": (_NUMBER, ("ra_pmra_corr", "rapmracor"), _NUMBER),
+    "dec_pmdec_corr": (_NUMBER, ("dec_pmdec_corr", "depmdecor"), _NUMBER),
 }
 _EPOCHS = ("ref_epoch", "refepoch", "epoch", "obsdate")
 _MAGNITUDES = (
@@ -92,12 +102,17 @@ _MAGNITUDES = (
     "jmag",
     "kmag",
 )
+_COLORS = ("bp_rp", "bp-rp", "bprp")
+# Where there is no color, it is the difference of these.
+_BLUE = ("phot_bp_mean_mag", "bpmag", "bp_mag")
+_RED = ("phot_rp_mean_mag", "rpmag", "rp_mag")
 _UNITS = {
     "ra": u.deg,
     "dec": u.deg,
     "ref_epoch": u.yr,
     "phot_g_mean_mag": u.mag,
-    **{name: unit for name, (unit, _, _) in _OPTIONAL.items()},
+    "bp_rp": u.mag,
+    **{name: unit for name, (unit, _, _) in _OPTIONAL.items() if unit != _NUMBER},
 }
 # Releases that a header, a table name or a description may mention.
 _GAIA_EPOCHS = (
@@ -448,11 +463,15 @@ def _standardize(table, name):
     for column, (unit, aliases, default) in _OPTIONAL.items():
         found = _first(names, aliases)
         if found is not None:
-            columns[column] = _values(table, found, unit, default, name, f"convertible to {unit}")
+            rule = "none" if unit == _NUMBER else f"convertible to {unit}"
+            columns[column] = _values(table, found, unit, default, name, rule)
     _add_ellipse_errors(columns, table, names, name)
     found = _first(names, _MAGNITUDES)
     if found is not None:
         columns["phot_g_mean_mag"] = _floats(table[found], name, found)
+    color = _colors(table, names, name)
+    if color is not None:
+        columns["bp_rp"] = color
     epoch = _epochs(table, names, pair, name, has_motion={"pmra", "pmdec"} <= set(columns))
     if epoch is not None:
         columns["ref_epoch"] = epoch
@@ -556,6 +575,17 @@ def _add_ellipse_errors(columns, table, names, name):
             columns["ra_error"] = np.sqrt(major**2 * c2 + minor**2 * s2)
             columns["dec_error"] = np.sqrt(major**2 * s2 + minor**2 * c2)
             return
+
+
+def _colors(table, names, name):
+    """Find the color of every star, or `None` where the table has neither it nor both bands."""
+    found = _first(names, _COLORS)
+    color = None if found is None else _floats(table[found], name, found)
+    bands = [_first(names, aliases) for aliases in (_BLUE, _RED)]
+    if None in bands:
+        return color
+    blue, red = (_floats(table[band], name, band) for band in bands)
+    return blue - red if color is None else np.where(np.isnan(color), blue - red, color)
 
 
 def _epochs(table, names, pair, name, has_motion):
