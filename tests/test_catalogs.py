@@ -447,6 +447,42 @@ def test_errors_grow_with_time():
     assert moved["dec_error"][0] == pytest.approx(1.0)
 
 
+def test_errors_and_correlations_are_those_of_drawn_stars():
+    position, motion, rho, years = 2.0, 0.3, -0.8, 12.0
+    table = Table(
+        {"ra": [1.0], "dec": [2.0], "pmra": [5.0], "pmdec": [-3.0], "ref_epoch": [2016.0]}
+    )
+    for axis in ("ra", "dec"):
+        table[f"{axis}_error"], table[f"pm{axis}_error"] = position, motion
+    table["ra_pmra_corr"], table["dec_pmdec_corr"] = rho, np.nan
+    moved = propagate(read_catalog(table), 2016.0 + years)
+    for axis, r in (("ra", rho), ("dec", 0.0)):
+        cov = [[position**2, r * position * motion], [r * position * motion, motion**2]]
+        p, m = np.random.default_rng(5).multivariate_normal([0, 0], cov, 200_000).T
+        later = p + m * years
+        assert moved[f"{axis}_error"][0] == pytest.approx(later.std(), rel=0.01)
+        correlation = moved[f"{axis}_pm{axis}_corr"][0]
+        assert correlation == pytest.approx(np.corrcoef(later, m)[0, 1], abs=0.01)
+    back = propagate(moved, 2016.0)
+    np.testing.assert_allclose([back["ra_error"][0], back["dec_error"][0]], position, rtol=1e-9)
+    np.testing.assert_allclose(
+        [back["ra_pmra_corr"][0], back["dec_pmdec_corr"][0]], [rho, 0], atol=1e-9
+    )
+
+
+def test_unknown_errors_do_not_hide_the_known():
+    table = Table({"ra": [1.0, 2.0, 3.0], "dec": [2.0] * 3, "pmra": [1.0] * 3, "pmdec": [1.0] * 3})
+    table["ref_epoch"] = 2016.0
+    table["pmra_error"] = [0.5, np.nan, 0.5]
+    moved = propagate(read_catalog(table), 2026.0)
+    np.testing.assert_array_equal(moved["ra_error"], [5.0, np.nan, 5.0])
+    assert "dec_error" not in moved.colnames
+    table["ra_error"] = [np.nan, 1.0, 12.0]
+    moved = propagate(read_catalog(table), 2026.0)
+    np.testing.assert_array_equal(moved["ra_error"], [5.0, 1.0, 13.0])
+    assert np.isnan(propagate(read_catalog(table), 2016.0)["ra_error"][0])
+
+
 def test_annual_parallax_is_that_of_astropy():
     table = stars()
     catalog = read_catalog(table)

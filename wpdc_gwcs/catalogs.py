@@ -227,8 +227,8 @@ def propagate(catalog, epoch, *, parallax=False):
     -------
     catalog : `~astropy.table.Table`
         A copy with ``ra``, ``dec``, ``pmra``, ``pmdec`` and ``ref_epoch`` at the new epoch,
-        position errors grown by the errors of the proper motion.  Stars without proper motion or
-        epoch stay put.
+        position errors grown by the errors of the proper motion, and ``ra_pmra_corr`` and
+        ``dec_pmdec_corr`` with them.  Stars without proper motion or epoch stay put.
 
     Notes
     -----
@@ -239,7 +239,15 @@ def propagate(catalog, epoch, *, parallax=False):
         u(t) = \langle r + \mu\,t \rangle, \qquad \mu = \mu_{\alpha*} p + \mu_\delta q
 
     where r is the direction at the reference epoch, p and q the unit vectors towards East and
-    North. It is exact at the poles and across RA 0.
+    North. It is exact at the poles and across RA 0.  The variance of a position grows on each axis
+    by
+
+    .. math::
+        \sigma^2(t) = \sigma^2 + 2 \rho\,\sigma\,\sigma_\mu t + \sigma_\mu^2 t^2
+
+    with the correlation :math:`\rho` of position and motion, zero where the catalogue gives none.
+    An error that is not known counts as zero; columns of position errors are made where the
+    catalogue has only those of the motions.  ``ra_dec_corr`` is left as it is.
 
     Examples
     --------
@@ -263,9 +271,8 @@ def propagate(catalog, epoch, *, parallax=False):
         ra[k], dec[k], pmra[k], pmdec[k] = _space_motion(ra[k], dec[k], pmra[k], pmdec[k], years[k])
         moved["pmra"], moved["pmdec"] = _column("pmra", pmra), _column("pmdec", pmdec)
         for axis in ("ra", "dec"):
-            grown = _grown_error(catalog, axis, np.where(k, years, 0.0))
-            if grown is not None:
-                moved[f"{axis}_error"] = _column(f"{axis}_error", grown)
+            for name, values in _grown_errors(catalog, axis, np.where(k, years, 0.0)).items():
+                moved[name] = _column(name, values)
     if parallax and "parallax" in catalog.colnames:
         plx = np.asarray(catalog["parallax"], float)
         k = np.isfinite(plx)
@@ -686,12 +693,34 @@ def _space_motion(ra, dec, pmra, pmdec, years):
     )
 
 
-def _grown_error(catalog, axis, years):
-    names = (f"{axis}_error", f"pm{axis}_error")
-    if not set(names) <= set(catalog.colnames):
-        return None
-    position, motion = (np.asarray(catalog[n], float) for n in names)
-    return np.sqrt(position**2 + (np.nan_to_num(motion) * years) ** 2)
+def _grown_errors(catalog, axis, years):
+    """Error of the position on one axis and its correlation with the motion, `years` later.
+
+    What is unknown counts as zero, so that an unknown error of the position does not hide what the
+    motion adds to it; the sum is NaN where nothing is known.
+    """
+    error, motion_error, correlation = f"{axis}_error", f"pm{axis}_error", f"{axis}_pm{axis}_corr"
+    if motion_error not in catalog.colnames:
+        return {}
+    given = _filled(catalog, error)
+    position, motion = np.nan_to_num(given), np.nan_to_num(_filled(catalog, motion_error))
+    rho = np.clip(np.nan_to_num(_filled(catalog, correlation)), -1.0, 1.0)
+    growth = motion * years
+    # Rounding must not make it negative where rho is -1.
+    variance = np.maximum(position**2 + 2 * rho * position * growth + growth**2, 0.0)
+    later = np.where(np.isnan(given) & (growth == 0), np.nan, np.sqrt(variance))
+    # The position has taken up the error of the motion: moving back gives the first error again.
+    product = np.nan_to_num(later) * motion
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rho = np.where(product > 0, (rho * position * motion + motion * growth) / product, rho)
+    return {error: later, correlation: rho}
+
+
+def _filled(catalog, name):
+    """Give a column as floats, NaN where the table does not have it."""
+    if name not in catalog.colnames:
+        return np.full(len(catalog), np.nan)
+    return np.asarray(catalog[name], float)
 
 
 def _annual_parallax(ra, dec, parallax, epoch):
