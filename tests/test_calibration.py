@@ -157,6 +157,32 @@ def test_catalogue_of_another_part_of_the_sky(simulation, catalog):
         match_frame(simulation.exposures[0].frame(), elsewhere)
 
 
+def test_stars_without_motion_do_not_spoil_the_solution():
+    """12 years after the catalogue, all stars have moved by 120 mas on the mean."""
+    sky = simulate(2, image_shape=SHAPE, density=25, distortion=15, seed=5, epoch=2028.0)
+    reference = read_catalog(sky.reference)
+    for name, bulk in (("ra", 8.0), ("dec", -6.0)):
+        stretch = np.cos(np.radians(reference["dec"])) if name == "ra" else 1.0
+        reference[name] -= bulk * 12.0 / 3.6e6 / stretch
+        reference[f"pm{name}"] += bulk
+    unknown = np.random.default_rng(2).uniform(size=len(reference)) < 0.4
+    for name in ("pmra", "pmdec"):
+        reference[name][unknown] = np.nan
+    catalog = read_catalog(reference)
+    frames = [e.frame() for e in sky.exposures]
+    matched = [match_frame(frame, catalog).reference for frame in frames]
+    rows = [np.asarray(m["catalog_index"]) for m in matched]
+    common, i, j = np.intersect1d(*rows, return_indices=True)
+    assert unknown[common].sum() > 100
+    for name in ("ra", "dec", "ra_error", "dec_error"):
+        np.testing.assert_array_equal(matched[0][name][i], matched[1][name][j])
+    # Also in processes of their own.
+    run = calibrate(frames, catalog, jobs=2)
+    for exposure, calibration in zip(sky.exposures, run.calibrations, strict=True):
+        # 0.16 px if they stay where they were, 0.005 px now.
+        assert rms_error(exposure, calibration.wcs) < 0.01
+
+
 def test_names_must_be_unique(simulation, catalog):
     frame = simulation.exposures[0].frame()
     with pytest.raises(ValueError, match="unique, got twice: sim-01"):

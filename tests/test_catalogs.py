@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
+from astropy.stats import mad_std
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.time import Time
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wpdc_gwcs.catalogs import propagate, read_catalog, select_cone
+from wpdc_gwcs.catalogs import fill_motions, propagate, read_catalog, select_cone
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
 
 
@@ -481,6 +482,154 @@ def test_unknown_errors_do_not_hide_the_known():
     moved = propagate(read_catalog(table), 2026.0)
     np.testing.assert_array_equal(moved["ra_error"], [5.0, 1.0, 13.0])
     assert np.isnan(propagate(read_catalog(table), 2016.0)["ra_error"][0])
+
+
+BULK, SPREAD, YEARS = np.array([8.0, -6.0]), 5.0, 12.0
+
+
+def moving_field(n=4000, unknown=0.4, center=(0.0, 40.0), seed=3):
+    """Stars of a common motion with a scatter, mas/yr; not all are known. Also all motions."""
+    rng = np.random.default_rng(seed)
+    frame = SkyCoord(*center, unit="deg").skyoffset_frame()
+    x, y = rng.uniform(-0.5, 0.5, (2, n)) * u.deg
+    pm = (BULK[:, None] + rng.normal(0, SPREAD, (2, n))) * u.mas / u.yr
+    sky = SkyCoord(x, y, pm_lon_coslat=pm[0], pm_lat=pm[1], frame=frame).icrs
+    table = Table({"ra": sky.ra.deg, "dec": sky.dec.deg})
+    table["pmra"], table["pmdec"] = sky.pm_ra_cosdec.to_value(pm.unit), sky.pm_dec.to_value(pm.unit)
+    table["ref_epoch"] = 2016.0
+    table["ra_error"], table["dec_error"] = 0.2, 0.3
+    table["pmra_error"], table["pmdec_error"] = 0.1, 0.1
+    known = table.copy()
+    lacking = rng.uniform(size=n) < unknown
+    for name in ("pmra", "pmdec", "pmra_error", "pmdec_error"):
+        table[name][lacking] = np.nan
+    return table, known, lacking
+
+
+# Across RA 0, and around the pole, where East turns from star to star.
+@pytest.mark.parametrize("center", [(0.0, 40.0), (77.0, 90.0)])
+def test_stars_of_unknown_motion_go_with_their_neighbors(center):
+    table, known, lacking = moving_field(center=center)
+    moved = propagate(read_catalog(table), 2016.0 + YEARS)
+    expected = truth(known, 2016.0 + YEARS)
+    expected = SkyCoord(expected.ra, expected.dec)
+    got = SkyCoord(moved["ra"], moved["dec"], unit="deg")
+    east, north = (a.to_value(u.mas) for a in expected.spherical_offsets_to(got))
+    np.testing.assert_array_equal(moved["pm_from_neighbors"], lacking)
+    assert np.hypot(east, north)[~lacking].max() < 1e-3
+    for offset, name, error in ((east, "ra_error", 0.2), (north, "dec_error", 0.3)):
+        offset, sigma = offset[lacking], np.asarray(moved[name])
+        # The common motion, 120 mas, is gone; the scatter of each, 60 mas, and of the median stay.
+        scatter = SPREAD * YEARS * np.sqrt(1 + 1.57 / 30)
+        assert np.abs(offset.mean()) < 3.5 * 60.0 * np.sqrt(1 / 1600 + 1.57 / 2400)
+        assert offset.std() == pytest.approx(scatter, rel=0.05)
+        assert np.median(sigma[lacking]) == pytest.approx(scatter, rel=0.05)
+        pulls = offset / sigma[lacking]
+        # The MAD of 30 stars is uncertain by a fifth, which widens the tails: 1.09 and 1.03, with
+        # a scatter of 0.035 between fields.
+        assert np.std(pulls) == pytest.approx(1.09, abs=0.1)
+        assert mad_std(pulls) == pytest.approx(1.03, abs=0.1)
+        np.testing.assert_allclose(sigma[~lacking], np.hypot(error, 0.1 * YEARS))
+
+
+@pytest.mark.parametrize("n_known", [5, 8])
+def test_error_of_a_filled_motion_is_right_with_few_known(rng, n_known):
+    n = n_known + 1
+    drawn = rng.normal(0, SPREAD, (500, n))
+    pulls = []
+    for pmra in drawn:
+        table = Table({"ra": np.linspace(10.0, 10.01, n), "dec": np.zeros(n), "pmra": pmra})
+        table["pmdec"], table["ref_epoch"] = 0.0, 2016.0
+        table["pmra"][0] = np.nan
+        catalog = fill_motions(read_catalog(table))
+        pulls.append((catalog["pmra"][0] - pmra[0], catalog["pmra_error"][0]))
+    offset, error = np.transpose(pulls)
+    assert error.mean() == pytest.approx(offset.std(), rel=0.1)
+
+
+def test_motion_is_that_of_the_near():
+    # Two groups of stars with motions of their own, and stars without one in each.
+    ra = np.r_[np.linspace(10.0, 10.1, 40), np.linspace(11.0, 11.1, 40)]
+    pmra = np.repeat([50.0, -50.0], 40) + np.tile([-1.0, 0.0, 1.0, 0.0], 20)
+    table = Table({"ra": ra, "dec": np.zeros(80), "pmra": pmra, "pmdec": np.full(80, 7.0)})
+    table["ref_epoch"] = 2016.0
+    table["pmra"][[3, 50]] = np.nan
+    table["pmdec"][[3, 20]] = np.nan
+    catalog = fill_motions(read_catalog(table))
+    assert catalog["pmra"][3] == pytest.approx(50.0, abs=1.0)
+    assert catalog["pmra"][50] == pytest.approx(-50.0, abs=1.0)
+    np.testing.assert_allclose(catalog["pmdec"], 7.0, atol=1e-9)
+    # What is known on one axis stays.
+    assert catalog["pmra"][20] == pmra[20]
+    assert np.isnan(catalog["pmra_error"][20])
+    assert np.flatnonzero(catalog["pm_from_neighbors"]).tolist() == [3, 20, 50]
+
+
+def test_a_star_moves_alike_in_every_part_of_the_catalogue():
+    table, _, lacking = moving_field(n=500)
+    whole = fill_motions(read_catalog(table))
+    part = select_cone(whole, 0.0, 40.0, 0.05)
+    assert 1 < len(part) < 20
+    assert np.any(part["pm_from_neighbors"])
+    rows = np.asarray(part["catalog_index"])
+    moved, all_moved = propagate(part, 2030.0), propagate(whole, 2030.0)[rows]
+    for name in ("ra", "dec", "ra_error", "dec_error"):
+        np.testing.assert_array_equal(moved[name], all_moved[name])
+    # Neither filling nor reading again takes a filled motion for a measured one.
+    assert fill_motions(whole) is whole
+    np.testing.assert_array_equal(read_catalog(whole)["pm_from_neighbors"], lacking)
+    # There and back again.
+    back = propagate(propagate(whole, 2030.0), 2016.0)
+    np.testing.assert_allclose(back["dec"], whole["dec"], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(back["ra_error"], whole["ra_error"], atol=1e-5)
+
+
+def test_errors_of_filled_motions_without_columns_of_errors():
+    table, _, lacking = moving_field(n=500)
+    table.remove_columns(["ra_error", "dec_error", "pmra_error", "pmdec_error"])
+    moved = propagate(read_catalog(table), 2016.0 + YEARS)
+    for name in ("ra_error", "dec_error"):
+        sigma = np.asarray(moved[name])
+        assert np.isnan(sigma[~lacking]).all()
+        assert np.median(sigma[lacking]) == pytest.approx(SPREAD * YEARS, rel=0.1)
+        assert moved[name].unit == u.mas
+    # At the epoch of the catalogue there is nothing to add.
+    assert np.isnan(propagate(read_catalog(table), 2016.0)["ra_error"]).all()
+
+
+@pytest.mark.parametrize("n_known", [0, 4])
+def test_too_few_known_motions_say_nothing(n_known):
+    table, _, _ = moving_field(n=30, unknown=0.0)
+    for name in ("pmra", "pmdec", "pmra_error", "pmdec_error"):
+        table[name][n_known:] = np.nan
+    catalog = read_catalog(table)
+    assert fill_motions(catalog) is catalog
+    moved = propagate(catalog, 2030.0)
+    for name in ("ra", "dec", "ra_error", "dec_error"):
+        np.testing.assert_array_equal(moved[name][n_known:], catalog[name][n_known:])
+    assert "pm_from_neighbors" not in moved.colnames
+
+
+def test_nothing_to_fill():
+    one = Table(
+        {"ra": [1.0], "dec": [2.0], "pmra": [np.nan], "pmdec": [np.nan], "ref_epoch": [2016.0]}
+    )
+    for table in (stars(), one, Table({"ra": [1.0], "dec": [2.0]})):
+        catalog = read_catalog(table)
+        assert fill_motions(catalog) is catalog
+    table, _, lacking = moving_field(n=100)
+    catalog = read_catalog(table)
+    fill_motions(catalog)
+    assert np.isnan(catalog["pmra"][lacking]).all()  # the argument is left alone
+
+
+def test_unknown_motion_and_unknown_epoch():
+    table, _, lacking = moving_field(n=100)
+    row = int(np.flatnonzero(lacking)[0])
+    table["ref_epoch"][row] = np.nan
+    moved = propagate(read_catalog(table), 2030.0)
+    assert moved["ra"][row] == table["ra"][row]
+    assert moved["ra_error"][row] == 0.2
 
 
 def test_annual_parallax_is_that_of_astropy():

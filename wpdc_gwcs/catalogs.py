@@ -2,28 +2,33 @@
 
 ::
 
-    file or table --read_catalog--> checked table --propagate--> at the epoch of the frame
+    file or table --read_catalog--> checked table --fill_motions--> all stars with a motion
                                                   --select_cone--> near the frame
+                                                  --propagate--> at the epoch of the frame
+
+Motions are filled from the whole catalogue, before the cut, so that a star moves alike in all
+frames.
 
 The checked table has plain float64 columns with fixed names and units, whatever the input called
 them:
 
-==================== ======== ==================================================================
-column               unit     meaning
-==================== ======== ==================================================================
-``ra``, ``dec``      deg      ICRS position at ``ref_epoch``
-``pmra``, ``pmdec``  mas / yr proper motion (``pmra`` includes cos Dec), NaN where unknown
-``parallax``         mas      NaN where unknown
-``ref_epoch``        yr       Julian year of the position
-``phot_g_mean_mag``  mag      a brightness, for ordering only
-``bp_rp``            mag      a color, NaN where unknown
-``ra_error``, ...    mas      errors of ``ra`` (times cos Dec), ``dec``, ``pmra``, ``pmdec``,
-                              ``parallax``; NaN where unknown
-``ra_pmra_corr``     --       correlation of the errors of ``ra`` and ``pmra``; likewise
-                              ``dec_pmdec_corr``
-``ra_dec_corr``      --       correlation of the errors of ``ra`` and ``dec``
-``catalog_index``    --       row of the input, zero based
-==================== ======== ==================================================================
+===================== ======== =================================================================
+column                unit     meaning
+===================== ======== =================================================================
+``ra``, ``dec``       deg      ICRS position at ``ref_epoch``
+``pmra``, ``pmdec``   mas / yr proper motion (``pmra`` includes cos Dec), NaN where unknown
+``parallax``          mas      NaN where unknown
+``ref_epoch``         yr       Julian year of the position
+``phot_g_mean_mag``   mag      a brightness, for ordering only
+``bp_rp``             mag      a color, NaN where unknown
+``ra_error``, ...     mas      errors of ``ra`` (times cos Dec), ``dec``, ``pmra``, ``pmdec``,
+                               ``parallax``; NaN where unknown
+``ra_pmra_corr``      --       correlation of the errors of ``ra`` and ``pmra``; likewise
+                               ``dec_pmdec_corr``
+``ra_dec_corr``       --       correlation of the errors of ``ra`` and ``dec``
+``catalog_index``     --       row of the input, zero based
+``pm_from_neighbors`` --       true where `fill_motions` filled the motion
+===================== ======== =================================================================
 """
 
 import re
@@ -36,11 +41,13 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.io.registry import IORegistryError
+from astropy.stats import mad_std
 from astropy.table import Column, Table
+from scipy.spatial import cKDTree
 
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
 
-__all__ = ["propagate", "read_catalog", "select_cone"]
+__all__ = ["fill_motions", "propagate", "read_catalog", "select_cone"]
 
 # Pairs of position columns, best first; compared without regard to case.
 _POSITIONS = (
@@ -135,6 +142,12 @@ _FORMATS = (
     (".asdf", None),
 )
 _MARK = "wpdc_catalog"
+# Stars whose median stands in for a motion that is not known.  Fewer than the least say nothing
+# about their scatter, hence nothing about the error of a star that is moved by them.
+_NEIGHBORS = 30
+_LEAST_NEIGHBORS = 5
+# Stars whose neighbours are looked up at once: some 30 MB.
+_BLOCK = 20000
 # What the readers of astropy raise on damaged or foreign files.
 _READ_ERRORS = (
     OSError,
@@ -210,13 +223,78 @@ def read_catalog(source, *, format=None):
     return _standardize(table, name)
 
 
+def fill_motions(catalog):
+    r"""Give stars without a known proper motion that of their neighbours.
+
+    Parameters
+    ----------
+    catalog : `~astropy.table.Table`
+        As returned by `read_catalog`; all of it, because a part has other neighbours.
+
+    Returns
+    -------
+    catalog : `~astropy.table.Table`
+        A copy with ``pmra``, ``pmdec``, ``pmra_error`` and ``pmdec_error`` filled in where the
+        motion was not known, and the boolean column ``pm_from_neighbors``.  The catalogue itself
+        where there is nothing to fill, where it has been filled, or where fewer than five stars
+        have a motion.
+
+    Notes
+    -----
+    The motion is the median of that of the n = 30 nearest stars on the sky that have one (all of
+    them, where they are fewer), its error on each axis
+
+    .. math::
+        \sigma_\mu = 1.4826\,\mathrm{MAD}\,\frac{n}{n - 0.8}\sqrt{1 + \frac{\pi}{2 n}}
+
+    from the scatter of these stars about their median, with the correction of the MAD for few of
+    them [1]_ and the variance of the median itself.  Directions are those at the star, also at the
+    poles.
+
+    References
+    ----------
+    .. [1] Croux, C. & Rousseeuw, P. J., 1992, Time-efficient algorithms for two highly robust
+       estimators of scale, Computational Statistics 1, 411.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs.catalogs import fill_motions, read_catalog
+    >>> table = Table({"ra": np.linspace(10.0, 10.1, 6), "dec": np.full(6, -5.0)})
+    >>> table["pmra"] = [1.0, 2.0, 3.0, 4.0, 100.0, np.nan]
+    >>> table["pmdec"], table["ref_epoch"] = -1.0, 2016.0
+    >>> catalog = fill_motions(read_catalog(table))
+    >>> round(float(catalog["pmra"][5]), 2), bool(catalog["pm_from_neighbors"][5])
+    (3.0, True)
+    """
+    names = set(catalog.colnames)
+    if not {"pmra", "pmdec"} <= names or "pm_from_neighbors" in names:
+        return catalog
+    motion = np.array([catalog["pmra"], catalog["pmdec"]], float)
+    unknown = ~np.isfinite(motion)
+    lacking = unknown.any(axis=0)
+    if not lacking.any() or np.sum(~lacking) < _LEAST_NEIGHBORS:
+        return catalog
+    median, error = _motion_of_neighbors(catalog, motion, ~lacking, np.flatnonzero(lacking))
+    filled = catalog.copy()
+    for k, name in enumerate(("pmra", "pmdec")):
+        for column, new in ((name, median[k]), (f"{name}_error", error[k])):
+            values = _floats_or_nan(catalog, column)
+            # One of the two may be known, and stays.
+            values[unknown[k]] = new[unknown[k, lacking]]
+            filled[column] = _column(column, values)
+    filled["pm_from_neighbors"] = lacking
+    return filled
+
+
 def propagate(catalog, epoch, *, parallax=False):
     r"""Move a catalogue to another epoch.
 
     Parameters
     ----------
     catalog : `~astropy.table.Table`
-        As returned by `read_catalog`.
+        As returned by `read_catalog`; a part of it better after `fill_motions`.
     epoch : float or `~astropy.time.Time`
         Julian year (TCB and TDB need not be told apart here).
     parallax : bool, optional
@@ -228,7 +306,8 @@ def propagate(catalog, epoch, *, parallax=False):
     catalog : `~astropy.table.Table`
         A copy with ``ra``, ``dec``, ``pmra``, ``pmdec`` and ``ref_epoch`` at the new epoch,
         position errors grown by the errors of the proper motion, and ``ra_pmra_corr`` and
-        ``dec_pmdec_corr`` with them.  Stars without proper motion or epoch stay put.
+        ``dec_pmdec_corr`` with them.  Stars without proper motion move with their neighbours (see
+        `fill_motions`); where too few stars have one, and without an epoch, they stay put.
 
     Notes
     -----
@@ -262,6 +341,7 @@ def propagate(catalog, epoch, *, parallax=False):
     epoch = float(getattr(epoch, "jyear", epoch))
     if not np.isfinite(epoch):
         raise ValueError(f"epoch must be a finite Julian year, got {epoch}")
+    catalog = fill_motions(catalog)
     moved = catalog.copy()
     ra, dec = np.array(catalog["ra"], float), np.array(catalog["dec"], float)
     if {"pmra", "pmdec", "ref_epoch"} <= set(catalog.colnames):
@@ -490,6 +570,9 @@ def _standardize(table, name):
         # What read_catalog returned, possibly cut since: its rows keep pointing to the first input.
         index = np.asarray(table["catalog_index"])
     result["catalog_index"] = index[keep]
+    if "pm_from_neighbors" in names and table[names["pm_from_neighbors"]].dtype.kind == "b":
+        # Else a second reading would take what has been filled for measured.
+        result["pm_from_neighbors"] = np.asarray(table[names["pm_from_neighbors"]])[keep]
     result.meta[_MARK] = name
     return result
 
@@ -693,6 +776,26 @@ def _space_motion(ra, dec, pmra, pmdec, years):
     )
 
 
+def _motion_of_neighbors(catalog, motion, known, rows):
+    """Median motion of the known stars nearest to each of some stars, and its error, (2, rows)."""
+    r, east, north = _directions(
+        np.asarray(catalog["ra"], float), np.asarray(catalog["dec"], float)
+    )
+    # In space, because East is not the same direction everywhere.
+    vectors = (motion[0, known] * east[:, known] + motion[1, known] * north[:, known]).T
+    tree = cKDTree(r[:, known].T)
+    n = min(_NEIGHBORS, len(vectors))
+    median, scatter = np.empty((2, len(rows))), np.empty((2, len(rows)))
+    for start in range(0, len(rows), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        near = vectors[tree.query(r[:, rows[block]].T, k=n)[1]]
+        for k, axis in enumerate((east, north)):
+            values = np.einsum("snc,cs->sn", near, axis[:, rows[block]])
+            median[k, block] = np.median(values, axis=1)
+            scatter[k, block] = mad_std(values, axis=1)
+    return median, scatter * n / (n - 0.8) * np.sqrt(1 + np.pi / 2 / n)
+
+
 def _grown_errors(catalog, axis, years):
     """Error of the position on one axis and its correlation with the motion, `years` later.
 
@@ -702,9 +805,9 @@ def _grown_errors(catalog, axis, years):
     error, motion_error, correlation = f"{axis}_error", f"pm{axis}_error", f"{axis}_pm{axis}_corr"
     if motion_error not in catalog.colnames:
         return {}
-    given = _filled(catalog, error)
-    position, motion = np.nan_to_num(given), np.nan_to_num(_filled(catalog, motion_error))
-    rho = np.clip(np.nan_to_num(_filled(catalog, correlation)), -1.0, 1.0)
+    given = _floats_or_nan(catalog, error)
+    position, motion = np.nan_to_num(given), np.nan_to_num(_floats_or_nan(catalog, motion_error))
+    rho = np.clip(np.nan_to_num(_floats_or_nan(catalog, correlation)), -1.0, 1.0)
     growth = motion * years
     # Rounding must not make it negative where rho is -1.
     variance = np.maximum(position**2 + 2 * rho * position * growth + growth**2, 0.0)
@@ -716,11 +819,11 @@ def _grown_errors(catalog, axis, years):
     return {error: later, correlation: rho}
 
 
-def _filled(catalog, name):
+def _floats_or_nan(catalog, name):
     """Give a column as floats, NaN where the table does not have it."""
     if name not in catalog.colnames:
         return np.full(len(catalog), np.nan)
-    return np.asarray(catalog[name], float)
+    return np.array(catalog[name], float)
 
 
 def _annual_parallax(ra, dec, parallax, epoch):

@@ -15,7 +15,7 @@ from wpdc_gwcs.calibration.start import (
     linear_wcs,
     sky_of,
 )
-from wpdc_gwcs.catalogs import propagate, select_cone
+from wpdc_gwcs.catalogs import fill_motions, propagate, select_cone
 from wpdc_gwcs.centroids import build_epsf, fit_centroids, subtract_stars
 from wpdc_gwcs.detection import detect_companions, detect_sources, subtract_background
 from wpdc_gwcs.exceptions import DetectionError, MatchError
@@ -264,7 +264,8 @@ def _reference_in_reach(frame, catalog, start, settings):
     # As wide as the match searches, see `match_planes`.
     margin = max(nx, ny) * (0.5 if settings.blind else 0.2) + 500
     radius = (np.hypot(nx, ny) / 2 + margin) * start.scale
-    near = select_cone(catalog, ra, dec, radius)
+    # Before the cut, which would take neighbours away; in a run it has been done for all frames.
+    near = select_cone(fill_motions(catalog), ra, dec, radius)
     if len(near) == 0:
         raise MatchError(
             f"{frame.source}: the catalogue has no star within {radius:.3f} deg of the frame's "

@@ -13,6 +13,7 @@ from astropy.table import QTable
 from wpdc_gwcs.calibration.detector import solve_detector
 from wpdc_gwcs.calibration.matched import match_frame, measure_sources
 from wpdc_gwcs.calibration.settings import Settings
+from wpdc_gwcs.catalogs import fill_motions
 from wpdc_gwcs.exceptions import FitError, FrameFailure, WPDCError
 from wpdc_gwcs.threads import one_blas_thread
 
@@ -100,6 +101,8 @@ def calibrate(
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {jobs}")
     progress = progress or (lambda stage, done, total: None)
+    # Once and from the whole catalogue: a star moves alike in all frames.
+    catalog = fill_motions(catalog)
 
     results = _match_frames(frames, catalog, solution, settings, jobs, executor, progress)
     failures = {n: r.error for n, r in results.items() if isinstance(r, FailedFrame)}
