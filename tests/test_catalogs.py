@@ -5,7 +5,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
+from astropy.coordinates import SkyCoord, get_body
 from astropy.io import fits
 from astropy.stats import mad_std
 from astropy.table import MaskedColumn, QTable, Table
@@ -653,6 +653,55 @@ def test_annual_parallax_is_that_of_astropy():
     assert got.separation(expected).max() < 1e-6 * u.arcsec
     assert seen["ra"][3] == unseen["ra"][3]
     assert np.abs(seen["ra"] - unseen["ra"]).max() > 1e-6
+
+
+@pytest.mark.parametrize("epoch", [2016.0, 2016.3, 2019.62])
+def test_stars_move_towards_the_sun_by_their_parallax(epoch):
+    table = Table({"ra": [270.0, 33.0], "dec": [66.5607, -20.0], "parallax": [100.0, 100.0]})
+    catalog = read_catalog(table)
+    seen = propagate(catalog, epoch, parallax=True)
+    before, after = (SkyCoord(c["ra"], c["dec"], unit="deg") for c in (catalog, seen))
+    sun = get_body("sun", Time(epoch, format="jyear"))
+    sun = SkyCoord(sun.ra, sun.dec)  # aberration and the Sun's own way are within a degree
+    shift = before.separation(after).to_value(u.mas)
+    angle = before.separation(sun)
+    # The distance of the Sun is within 1.7 % of an au, that of the barycentre within 0.8 % of it.
+    np.testing.assert_allclose(shift, 100.0 * np.sin(angle), rtol=0.03)
+    turn = before.position_angle(after) - before.position_angle(sun)
+    assert np.abs(turn.wrap_at(180 * u.deg)).max() < 2 * u.deg
+    assert seen["parallax"].tolist() == [100.0, 100.0]
+
+
+def test_noise_of_parallaxes_is_not_applied(rng):
+    n = 20_000
+    true = rng.exponential(0.4, n)
+    error = np.exp(rng.uniform(np.log(0.05), np.log(1.0), n))
+    measured = true + error * rng.normal(size=n)
+    error[0], measured[1] = np.nan, np.nan
+    table = Table({"ra": np.full(n, 40.0), "dec": np.full(n, 15.0), "parallax": measured})
+
+    def shifts(parallax, error=None):
+        table["parallax"] = parallax
+        table["parallax_error"] = np.zeros(n) if error is None else error
+        seen = propagate(read_catalog(table), 2016.3, parallax=True)
+        return (np.asarray(seen["ra"]) - 40.0) * 3.6e6
+
+    unit = shifts(np.ones(n))[0]
+    applied = shifts(measured, error) / unit
+    # An unknown error leaves the value, an unknown parallax the place.
+    assert applied[0] == pytest.approx(measured[0], abs=1e-4)
+    assert applied[1] == 0.0
+    used = applied[2:]
+    rms = np.sqrt(np.mean((used - true[2:]) ** 2))
+    plain = np.sqrt(np.mean((measured[2:] - true[2:]) ** 2))
+    significant = np.where(measured > 3 * error, measured, 0.0)[2:]
+    assert rms < 0.31 < 0.8 * plain
+    assert rms < 0.85 * np.sqrt(np.mean((significant - true[2:]) ** 2))
+    assert rms < 0.6 * np.sqrt(np.mean(true**2))
+    assert used.min() >= -1e-6
+    # Near stars keep theirs; without errors all do, whatever their sign.
+    assert shifts(np.full(n, 50.0), np.full(n, 0.5))[0] / unit == pytest.approx(50.0, rel=2e-4)
+    assert shifts(np.full(n, -2.0))[0] / unit == pytest.approx(-2.0, rel=1e-4)
 
 
 @pytest.mark.parametrize("epoch", [np.nan, np.inf])

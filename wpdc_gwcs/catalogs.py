@@ -299,7 +299,7 @@ def propagate(catalog, epoch, *, parallax=False):
         Julian year (TCB and TDB need not be told apart here).
     parallax : bool, optional
         Add the annual parallax as seen from the Earth's centre, so that the positions are
-        *apparent* directions rather than barycentric ones.  Off by default.
+        *apparent* directions rather than barycentric ones.  Off by default; `calibrate` uses it.
 
     Returns
     -------
@@ -328,6 +328,15 @@ def propagate(catalog, epoch, *, parallax=False):
     An error that is not known counts as zero; columns of position errors are made where the
     catalogue has only those of the motions.  ``ra_dec_corr`` is left as it is.
 
+    Of a parallax :math:`\varpi` with the error :math:`\sigma_\varpi` is used
+
+    .. math::
+        \varpi \left(1 - \sigma_\varpi^2 / \varpi^2\right) \quad
+        \text{where } \varpi > \sigma_\varpi, \quad 0 \text{ elsewhere,}
+
+    because most faint stars are farther than their parallaxes can tell, and a negative one is all
+    noise.  Without an error, the parallax is used as it is.  The column keeps what was given.
+
     Examples
     --------
     >>> from astropy.table import Table
@@ -354,7 +363,7 @@ def propagate(catalog, epoch, *, parallax=False):
             for name, values in _grown_errors(catalog, axis, np.where(k, years, 0.0)).items():
                 moved[name] = _column(name, values)
     if parallax and "parallax" in catalog.colnames:
-        plx = np.asarray(catalog["parallax"], float)
+        plx = _measured_parallax(catalog)
         k = np.isfinite(plx)
         ra[k], dec[k] = _annual_parallax(ra[k], dec[k], plx[k], epoch)
     moved["ra"], moved["dec"] = _column("ra", ra), _column("dec", dec)
@@ -824,6 +833,22 @@ def _floats_or_nan(catalog, name):
     if name not in catalog.colnames:
         return np.full(len(catalog), np.nan)
     return np.array(catalog[name], float)
+
+
+def _measured_parallax(catalog):
+    """Parallax less what may be its noise.
+
+    Stars at exp(-p / 0.4 mas) with errors of 0.05 to 1 mas, log-uniform: it leaves 0.29 mas rms,
+    the parallaxes as they are 0.41, those above three errors alone 0.36, none at all 0.56.  With
+    errors of 0.5 to 1 mas: 0.51, 0.76, 0.55 and 0.56.
+    """
+    parallax = np.array(catalog["parallax"], float)
+    error = np.nan_to_num(_floats_or_nan(catalog, "parallax_error"))
+    noisy = error > 0
+    above = noisy & (parallax > error)
+    parallax[noisy & (parallax <= error)] = 0.0
+    parallax[above] -= error[above] ** 2 / parallax[above]
+    return parallax
 
 
 def _annual_parallax(ra, dec, parallax, epoch):

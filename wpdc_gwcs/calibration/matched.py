@@ -271,4 +271,4 @@ def _reference_in_reach(frame, catalog, start, settings):
             f"{frame.source}: the catalogue has no star within {radius:.3f} deg of the frame's "
             f"centre, RA {ra:.4f} Dec {dec:.4f} deg"
         )
-    return near if frame.epoch is None else propagate(near, frame.epoch)
+    return near if frame.epoch is None else propagate(near, frame.epoch, parallax=True)
