@@ -299,7 +299,7 @@ def propagate(catalog, epoch, *, parallax=False):
         Julian year (TCB and TDB need not be told apart here).
     parallax : bool, optional
         Add the annual parallax as seen from the Earth's centre, so that the positions are
-        *apparent* directions rather than barycentric ones.  Off by default; `calibrate` uses it.
+        *apparent* directions rather than barycentric ones.  Off by default; a calibration uses it.
 
     Returns
     -------
