@@ -53,6 +53,8 @@ class MatchedFrame:
     diagnostics: object
     from_image: bool
     seconds: float
+    exposure: str | None = None  # as in `Frame`: with others of the camera, or on its own
+    camera: str | None = None
 
     @property
     def n_sources(self):
@@ -207,6 +209,8 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
         diagnostics=diagnostics,
         from_image=frame.load_image is not None,
         seconds=time.perf_counter() - began,
+        exposure=frame.exposure,
+        camera=frame.camera,
     )
 
 

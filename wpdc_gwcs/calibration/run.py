@@ -11,6 +11,7 @@ import numpy as np
 from astropy.table import QTable
 
 from wpdc_gwcs.calibration.detector import solve_detector
+from wpdc_gwcs.calibration.exposures import tie_exposures
 from wpdc_gwcs.calibration.matched import match_frame, measure_sources
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.exceptions import FitError, FrameFailure, WPDCError
@@ -85,6 +86,11 @@ def calibrate(
     ValueError
         If two frames have the same name, or there is none.
 
+    Warns
+    -----
+    WPDCWarning
+        If frames that are said to be of one exposure cannot be, see `tie_exposures`.
+
     References
     ----------
     WPDC-2P, arXiv:2603.09193.
@@ -100,6 +106,7 @@ def calibrate(
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {jobs}")
     progress = progress or (lambda stage, done, total: None)
+    frames = tie_exposures(frames)
 
     results = _match_frames(frames, catalog, solution, settings, jobs, executor, progress)
     failures = {n: r.error for n, r in results.items() if isinstance(r, FailedFrame)}
@@ -227,6 +234,8 @@ def _summarize(frames, results, calibrations, failures):
         row = {
             "frame": frame.name,
             "detector": frame.detector,
+            "camera": frame.camera or "",
+            "exposure": frame.exposure or "",
             "status": "failed" if found is None else "solved",
             "reason": " ".join(str(failures[frame.name]).split()) if found is None else "",
             "n_sources": result.n_sources,
