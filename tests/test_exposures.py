@@ -48,11 +48,15 @@ def test_one_identifier_of_several_exposures():
 
 
 def test_one_detector_cannot_be_in_an_exposure_twice():
-    with pytest.warns(WPDCWarning, match="3 frames of camera C .* have the detector 'A' twice"):
+    with pytest.warns(WPDCWarning, match="3 frames of camera C .* have a detector twice"):
         assert exposures([make("A"), make("B"), make("A"), make("A", "8")]) == [None] * 3 + ["8"]
+
+
+def test_files_and_tangent_points_tell_exposures_of_one_key_apart():
     frames = [make(d, file=f, start=None) for f in ("x.fits", "y.fits") for d in "AB"]
-    with pytest.warns(WPDCWarning, match="each file is taken as one"):
-        assert exposures(frames) == ["7 x.fits"] * 2 + ["7 y.fits"] * 2
+    assert exposures(frames) == ["7", "7", "7#2", "7#2"]
+    frames = [make(d, ra=ra) for d in "AB" for ra in (150.0, 150.01)]
+    assert exposures(frames) == ["7", "7#2"] * 2
 
 
 def test_detectors_that_point_elsewhere_are_another_exposure():

@@ -42,7 +42,8 @@ def tie_exposures(frames):
     Notes
     -----
     Frames of one key that began at different times are different exposures: some observatories give
-    one identifier to several exposures, or begin to count anew each night.
+    one identifier to several exposures, or begin to count anew each night.  Where a detector is
+    still there twice, the frames of a file stay together, else those with one tangent point.
     """
     groups = {}
     for row, frame in enumerate(frames):
@@ -52,9 +53,17 @@ def tie_exposures(frames):
     for (_, exposure), rows in groups.items():
         if len(rows) < 2:
             continue
-        parts = [p for together in _by_start(frames, rows) for p in _by_place(frames, together)]
+        parts = []
+        for part in [p for same in _by_start(frames, rows) for p in _by_place(frames, same)]:
+            split = _without_doubles(frames, part)
+            if split is None:
+                _warn(frames, part, "have a detector twice; each is taken on its own")
+                tied = [replace(f, exposure=None) if i in part else f for i, f in enumerate(tied)]
+            else:
+                parts += split
         for number, part in enumerate(parts):
-            for row, key in zip(part, _checked(frames, part, exposure, number), strict=True):
+            key = exposure if number == 0 else f"{exposure}#{number + 1}"
+            for row in part:
                 tied[row] = replace(frames[row], exposure=key)
     return tied
 
@@ -98,20 +107,34 @@ def _place(frame):
     return at, size
 
 
-def _checked(frames, rows, exposure, number):
-    """Keys of frames that agree in time and place; no detector can be in an exposure twice."""
-    key = exposure if number == 0 else f"{exposure}#{number + 1}"
-    detectors = [frames[row].detector for row in rows]
-    if len(set(detectors)) == len(detectors):
-        return [key] * len(rows)
-    twice = sorted({d for d in detectors if detectors.count(d) > 1})
-    files = [re.sub(r"\[[^\[\]]*\]$", "", frames[row].source) for row in rows]
-    pairs = set(zip(files, detectors, strict=True))
-    if len(pairs) == len(rows) and len(set(files)) < len(files):
-        _warn(frames, rows, f"have the detector {twice[0]!r} twice; each file is taken as one")
-        return [f"{key} {file}" if files.count(file) > 1 else None for file in files]
-    _warn(frames, rows, f"have the detector {twice[0]!r} twice; each is taken on its own")
-    return [None] * len(rows)
+def _without_doubles(frames, rows):
+    """Split frames that have a detector twice, by file or by tangent point; `None` if neither can.
+
+    The detectors of one exposure mostly have one tangent point in their headers, and dithered
+    exposures have others.
+    """
+    if not _has_double(frames, rows):
+        return [rows]
+    for label in (_file_of, _tangent_point):
+        parts = {}
+        for row in rows:
+            parts.setdefault(label(frames[row]), []).append(row)
+        if 1 < len(parts) < len(rows) and not any(_has_double(frames, p) for p in parts.values()):
+            return list(parts.values())
+    return None
+
+
+def _has_double(frames, rows):
+    return len({frames[row].detector for row in rows}) < len(rows)
+
+
+def _file_of(frame):
+    return re.sub(r"\[[^\[\]]*\]$", "", frame.source)
+
+
+def _tangent_point(frame):
+    header = getattr(frame.wcs, "wcs", None)
+    return None if header is None else tuple(np.round(header.crval, 7))
 
 
 def _warn(frames, rows, what):

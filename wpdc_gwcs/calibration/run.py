@@ -12,7 +12,8 @@ from astropy.table import QTable
 
 from wpdc_gwcs.calibration.detector import solve_detector
 from wpdc_gwcs.calibration.exposures import tie_exposures
-from wpdc_gwcs.calibration.matched import match_frame, measure_sources
+from wpdc_gwcs.calibration.matched import FailedFrame, match_frame, measure_sources
+from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.exceptions import FitError, FrameFailure, WPDCError
 from wpdc_gwcs.threads import one_blas_thread
@@ -109,6 +110,7 @@ def calibrate(
     frames = tie_exposures(frames)
 
     results = _match_frames(frames, catalog, solution, settings, jobs, executor, progress)
+    results = start_from_neighbors(frames, results, catalog, settings, solution=solution)
     failures = {n: r.error for n, r in results.items() if isinstance(r, FailedFrame)}
     matched = [r for r in results.values() if not isinstance(r, FailedFrame)]
 
@@ -135,25 +137,17 @@ def calibrate(
     return CalibrationRun(ordered, solutions, failures, summary)
 
 
-@dataclass(frozen=True)
-class FailedFrame:
-    """A frame that could not be matched, and why."""
-
-    error: WPDCError
-    n_sources: int
-    seconds: float
-
-
 @one_blas_thread
 def _match_or_fail(frame, catalog, solution, settings):
     began = time.perf_counter()
-    sources = ()
+    sources = None
     try:
         stored = _stored_for(solution, frame)
         sources = measure_sources(frame, settings)
         return match_frame(frame, catalog, settings, sources=sources, solution=stored)
     except WPDCError as err:
-        return FailedFrame(err, len(sources), time.perf_counter() - began)
+        n_sources = 0 if sources is None else len(sources)
+        return FailedFrame(err, n_sources, time.perf_counter() - began, sources)
 
 
 # A worker process is given the catalogue once, not with each frame.
