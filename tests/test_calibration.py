@@ -83,7 +83,7 @@ def test_held_out_stars_are_in_no_fit_and_as_good_as_the_others(run):
 
 def test_summary_has_a_row_per_frame(run):
     assert run.summary.colnames == [
-        "frame", "detector", "status", "reason", "n_sources", "n_matched",
+        "frame", "detector", "camera", "exposure", "status", "reason", "n_sources", "n_matched",
         "n_pairs", "n_ambiguous", "expected_by_chance", "purity", "completeness", "significance",
         "mean_dx", "sigma_dx", "mean_dy", "sigma_dy", "holdout_sigma_dx", "holdout_sigma_dy",
         "rms_mas", "seconds",
@@ -93,7 +93,7 @@ def test_summary_has_a_row_per_frame(run):
     assert np.all(np.isfinite(run.summary["holdout_sigma_dy"]))
     for row, calibration in zip(run.summary, run.calibrations, strict=True):
         evidence = calibration.statistics["match"]
-        for name in run.summary.colnames[6:12]:
+        for name in run.summary.colnames[8:14]:
             assert row[name] == evidence[name]
         assert row["n_pairs"] > 100 * row["expected_by_chance"]
         assert 0.9 < row["completeness"] <= 1

@@ -43,6 +43,16 @@ def test_epoch_must_be_finite(value):
         make(epoch=value)
 
 
+def test_a_frame_is_on_its_own_unless_it_has_keys():
+    assert (make().exposure, make().camera) == (None, None)
+    frame = make(exposure="123", camera="CAM")
+    assert (frame.exposure, frame.camera) == ("123", "CAM")
+    for key in ("exposure", "camera"):
+        for value in ("", 5):
+            with pytest.raises(ValueError, match=f"{key} must be a text that is not empty"):
+                make(**{key: value})
+
+
 @pytest.mark.parametrize("name", ["", "a/b"])
 def test_names_are_fit_for_files(name):
     with pytest.raises(ValueError, match="name must be fit for a file name, got"):

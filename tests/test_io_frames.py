@@ -330,6 +330,73 @@ def test_latin1_in_the_header_of_a_list(tmp_path):
     assert read_frames(tmp_path / "a.cat")[0].wcs.wcs.crval[1] == 2.0
 
 
+# --- camera and exposure ------------------------------------------------------------------------
+
+
+def keys_of(path, **options):
+    return [(f.camera, f.exposure) for f in read_frames(path, **options)]
+
+
+NOON = "2016-01-01T12:00:00."
+
+
+@pytest.mark.parametrize(
+    ("cards", "camera", "exposure"),
+    [
+        ({"INSTRUME": "Suprime-Cam", "EXPNUM": 17}, "SUPRIMECAM", "17"),
+        ({"INSTRUME": "SUPRIMECAM ", "TELESCOP": "Subaru", "OBSID": "a.1"}, "SUPRIMECAM", "a.1"),
+        ({"TELESCOP": "Bok 2.3m", "DATE-OBS": "2016-01-01T12:00:00"}, "BOK23M", f"{NOON}000"),
+        ({"INSTRUME": "C", "DATE-OBS": "2016-01-01", "UT": "12:00:00.5"}, "C", f"{NOON}500"),
+        ({"INSTRUME": "C", "MJD-OBS": 57388.5}, "C", f"{NOON}000"),
+        # many exposures of a night share the day, and no detail of a placeholder
+        ({"INSTRUME": "C", "DATE-OBS": "2016-01-01", "MJD-OBS": 57388.0}, "C", None),
+        ({"INSTRUME": "C", "EXPNUM": 0, "OBSID": "unknown"}, "C", None),
+        ({"EXPNUM": 17, "DATE-OBS": "2016-01-01T12:00:00"}, None, None),
+    ],
+)
+def test_camera_and_exposure(tmp_path, cards, camera, exposure):
+    path = write_image(tmp_path / "a.fits", **cards)
+    assert keys_of(path) == [(camera, exposure)]
+    assert keys_of(path, camera=False) == [(None, None)]
+
+
+def test_keyword_of_the_exposure(tmp_path):
+    path = write_image(tmp_path / "a.fits", INSTRUME="C", EXPNUM=17, VISIT="v3")
+    assert keys_of(path, exposure_keyword="VISIT") == [("C", "v3")]
+    with pytest.raises(FrameError, match=r"a\.fits: the header must have the keyword 'SHOT'"):
+        read_frames(path, exposure_keyword="SHOT")
+    path = write_image(tmp_path / "b.fits", VISIT="v3")
+    assert keys_of(path, exposure_keyword="VISIT") == [("camera", "v3")]
+
+
+def test_detectors_of_one_file_are_one_exposure(tmp_path):
+    path = multi_extension(tmp_path / "m.fits")
+    assert keys_of(path) == [("camera", str(path))] * 2 == keys_of(f"{path}[1]") * 2
+    path = multi_extension(tmp_path / "n.fits", primary={"INSTRUME": "C", "EXPNUM": 4})
+    assert keys_of(path) == [("C", "4")] * 2 == keys_of(f"{path}[1]") * 2
+    # each detector may write its own time, but not its own number
+    times = [f"2016-01-01T12:00:00.{i}" for i in range(2)]
+    for name, cards, exposures in (
+        ("t", [{"DATE-OBS": t} for t in times], [str(tmp_path / "t.cat")] * 2),
+        ("e", [{"EXPNUM": n} for n in (1, 2)], ["1", "2"]),
+    ):
+        lists = [
+            (tan_header(EXTNAME=f"C{i}", INSTRUME="C", **c), sextractor_columns())
+            for i, c in enumerate(cards)
+        ]
+        path = write_ldac(tmp_path / f"{name}.cat", *lists)
+        assert keys_of(path) == [("C", e) for e in exposures]
+
+
+def test_table_of_sources_has_the_keys_of_its_header(tmp_path):
+    Table({"x": [1.0, 50.0], "y": [1.0, 30.0]}).write(tmp_path / "s.ecsv")
+    header = tan_header(INSTRUME="C", EXPNUM=5, NAXIS1=60, NAXIS2=40)
+    header.totextfile(tmp_path / "w.head")
+    assert keys_of(tmp_path / "s.ecsv", wcs=tmp_path / "w.head") == [("C", "5")]
+    keys = keys_of(tmp_path / "s.ecsv", wcs=tmp_path / "w.head", camera=False)
+    assert keys == [(None, None)]
+
+
 # --- columns ------------------------------------------------------------------------------------
 
 

@@ -33,13 +33,18 @@ class Frame:
         ``snr``, ``roundness``, ``flags``).  Exactly one of the two loaders is given.
     gain, saturation : float, optional
         Electrons per count and saturation level in counts, from the header.
+    exposure : str, optional
+        What tells the exposure from others of its camera: frames with the same camera and exposure
+        were taken at once by the detectors of a mosaic.  `None`: the frame is on its own.
+    camera : str, optional
+        Name of the camera, whose detectors share a focal plane; `None`: the detector is on its own.
     meta : dict
         Other facts of the header worth keeping (filter, exposure time, ...).
 
     Raises
     ------
     ValueError
-        If there is not exactly one loader, or the name, epoch or shape is impossible.
+        If there is not exactly one loader, or the name, epoch, shape or a key is impossible.
 
     Examples
     --------
@@ -61,6 +66,8 @@ class Frame:
     load_sources: Callable | None = None
     gain: float | None = None
     saturation: float | None = None
+    exposure: str | None = None
+    camera: str | None = None
     meta: dict = field(default_factory=dict)
 
     def __post_init__(self):
@@ -70,6 +77,10 @@ class Frame:
             raise ValueError(f"name must be fit for a file name, got {self.name!r}")
         if self.epoch is not None and not math.isfinite(self.epoch):
             raise ValueError(f"epoch must be a finite Julian year or None, got {self.epoch}")
+        for label in ("exposure", "camera"):
+            value = getattr(self, label)
+            if not (value is None or (isinstance(value, str) and value)):
+                raise ValueError(f"{label} must be a text that is not empty or None, got {value!r}")
         try:
             shape = tuple(int(n) for n in self.image_shape)
             valid = len(shape) == 2 and min(shape) >= 1 and shape == tuple(self.image_shape)

@@ -18,10 +18,19 @@ from wpdc_gwcs.calibration.start import (
 from wpdc_gwcs.catalogs import fill_motions, propagate, select_cone
 from wpdc_gwcs.centroids import build_epsf, fit_centroids, subtract_stars
 from wpdc_gwcs.detection import detect_companions, detect_sources, subtract_background
-from wpdc_gwcs.exceptions import DetectionError, MatchError
+from wpdc_gwcs.exceptions import DetectionError, MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
 
-__all__ = ["MatchedFrame", "match_frame", "measure_sources"]
+__all__ = [
+    "FailedFrame",
+    "MatchedFrame",
+    "match_frame",
+    "measure_sources",
+    "optional_column",
+    "reference_in_reach",
+    "usable_sources",
+    "with_errors",
+]
 
 log = logging.getLogger(__name__)
 
@@ -53,11 +62,23 @@ class MatchedFrame:
     diagnostics: object
     from_image: bool
     seconds: float
+    exposure: str | None = None  # as in `Frame`: with others of the camera, or on its own
+    camera: str | None = None
 
     @property
     def n_sources(self):
         """Number of sources."""
         return len(self.sources)
+
+
+@dataclass(frozen=True, eq=False)
+class FailedFrame:
+    """A frame that could not be matched, why, and what was measured on it."""
+
+    error: WPDCError
+    n_sources: int
+    seconds: float
+    sources: Table | None = None
 
 
 def measure_sources(frame, settings=None):
@@ -168,8 +189,8 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     began = time.perf_counter()
     if sources is None:
         sources = measure_sources(frame, settings)
-    sources = _with_errors(sources)
-    usable = _usable(sources, frame.image_shape)
+    sources = with_errors(sources)
+    usable = usable_sources(sources, frame.image_shape)
     x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)
     if solution is None:
         start = linear_wcs(frame.wcs, header_reference_point(frame))
@@ -177,7 +198,7 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     else:
         start = linear_wcs(frame.wcs, solution.crpix)
         xs, ys = solution.undistort(x, y)
-    reference = _reference_in_reach(frame, catalog, start, settings)
+    reference = reference_in_reach(frame, catalog, start, settings)
     xr, yr = start.pixels(np.asarray(reference["ra"]), np.asarray(reference["dec"]))
     pick = np.flatnonzero(usable & np.isfinite(xs) & np.isfinite(ys))
     i_src, i_ref, diagnostics = match_planes(
@@ -207,6 +228,8 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
         diagnostics=diagnostics,
         from_image=frame.load_image is not None,
         seconds=time.perf_counter() - began,
+        exposure=frame.exposure,
+        camera=frame.camera,
     )
 
 
@@ -230,8 +253,19 @@ def optional_column(table, name, rows=slice(None)):
     return np.asarray(table[name], dtype=float)[rows] if name in table.colnames else None
 
 
-def _with_errors(sources):
-    """Add errors by signal-to-noise where a list has none; their scale is fitted later."""
+def with_errors(sources):
+    """Add errors by signal-to-noise where a list has none; their scale is fitted later.
+
+    Parameters
+    ----------
+    sources : `~astropy.table.Table`
+        What was measured.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        The same, or a copy with ``x_err`` and ``y_err``.
+    """
     if "snr" not in sources.colnames or {"x_err", "y_err"} <= set(sources.colnames):
         return sources
     sources = sources.copy()
@@ -241,8 +275,21 @@ def _with_errors(sources):
     return sources
 
 
-def _usable(sources, image_shape):
-    """Mark the sources that may enter the match: clean, round, well measured, on the detector."""
+def usable_sources(sources, image_shape):
+    """Mark the sources that may enter the match: clean, round, well measured, on the detector.
+
+    Parameters
+    ----------
+    sources : `~astropy.table.Table`
+        What was measured.
+    image_shape : (int, int)
+        Shape ``(ny, nx)`` of the detector.
+
+    Returns
+    -------
+    (N,) ndarray of bool
+        Mask over the sources.
+    """
     ny, nx = image_shape
     x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)
     with np.errstate(invalid="ignore"):
@@ -256,8 +303,30 @@ def _usable(sources, image_shape):
     return usable
 
 
-def _reference_in_reach(frame, catalog, start, settings):
-    """Select the reference stars that the frame can show, at its epoch."""
+def reference_in_reach(frame, catalog, start, settings):
+    """Select the reference stars that the frame can show, at its epoch.
+
+    Parameters
+    ----------
+    frame : Frame
+        Its WCS tells where.
+    catalog : `~astropy.table.Table`
+        Reference catalogue.
+    start : LinearWCS
+        Its scale counts.
+    settings : Settings
+        A blind search needs more.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        Rows of the catalogue.
+
+    Raises
+    ------
+    MatchError
+        If there are none.
+    """
     ny, nx = frame.image_shape
     center = detector_center(frame.image_shape)
     ra, dec = (float(c) for c in np.ravel(sky_of(frame.wcs, *center[:, None])))

@@ -11,7 +11,9 @@ import numpy as np
 from astropy.table import QTable
 
 from wpdc_gwcs.calibration.detector import solve_detector
-from wpdc_gwcs.calibration.matched import match_frame, measure_sources
+from wpdc_gwcs.calibration.exposures import tie_exposures
+from wpdc_gwcs.calibration.matched import FailedFrame, match_frame, measure_sources
+from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.catalogs import fill_motions
 from wpdc_gwcs.exceptions import FitError, FrameFailure, WPDCError
@@ -86,6 +88,11 @@ def calibrate(
     ValueError
         If two frames have the same name, or there is none.
 
+    Warns
+    -----
+    WPDCWarning
+        If frames that are said to be of one exposure cannot be, see `tie_exposures`.
+
     References
     ----------
     WPDC-2P, arXiv:2603.09193.
@@ -103,8 +110,10 @@ def calibrate(
     progress = progress or (lambda stage, done, total: None)
     # Once and from the whole catalogue: a star moves alike in all frames.
     catalog = fill_motions(catalog)
+    frames = tie_exposures(frames)
 
     results = _match_frames(frames, catalog, solution, settings, jobs, executor, progress)
+    results = start_from_neighbors(frames, results, catalog, settings, solution=solution)
     failures = {n: r.error for n, r in results.items() if isinstance(r, FailedFrame)}
     matched = [r for r in results.values() if not isinstance(r, FailedFrame)]
 
@@ -131,25 +140,17 @@ def calibrate(
     return CalibrationRun(ordered, solutions, failures, summary)
 
 
-@dataclass(frozen=True)
-class FailedFrame:
-    """A frame that could not be matched, and why."""
-
-    error: WPDCError
-    n_sources: int
-    seconds: float
-
-
 @one_blas_thread
 def _match_or_fail(frame, catalog, solution, settings):
     began = time.perf_counter()
-    sources = ()
+    sources = None
     try:
         stored = _stored_for(solution, frame)
         sources = measure_sources(frame, settings)
         return match_frame(frame, catalog, settings, sources=sources, solution=stored)
     except WPDCError as err:
-        return FailedFrame(err, len(sources), time.perf_counter() - began)
+        n_sources = 0 if sources is None else len(sources)
+        return FailedFrame(err, n_sources, time.perf_counter() - began, sources)
 
 
 # A worker process is given the catalogue once, not with each frame.
@@ -230,6 +231,8 @@ def _summarize(frames, results, calibrations, failures):
         row = {
             "frame": frame.name,
             "detector": frame.detector,
+            "camera": frame.camera or "",
+            "exposure": frame.exposure or "",
             "status": "failed" if found is None else "solved",
             "reason": " ".join(str(failures[frame.name]).split()) if found is None else "",
             "n_sources": result.n_sources,

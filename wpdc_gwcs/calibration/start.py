@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wpdc_gwcs.models import project
+from wpdc_gwcs.models import deproject, project
 
 __all__ = [
     "LinearWCS",
@@ -53,6 +53,23 @@ class LinearWCS:
         """
         plane = np.array(project(np.asarray(ra, float), np.asarray(dec, float), self.crval))
         return np.linalg.solve(self.cd, plane) + self.crpix[:, None]
+
+    def sky(self, x, y):
+        """Sky positions of undistorted pixels.
+
+        Parameters
+        ----------
+        x, y : (N,) array_like
+            Pixel coordinates, zero based.
+
+        Returns
+        -------
+        ra, dec : (N,) ndarray
+            ICRS, deg.
+        """
+        pixels = np.array([np.ravel(x), np.ravel(y)], float)
+        ra, dec = deproject(*(self.cd @ (pixels - self.crpix[:, None])), self.crval)
+        return np.reshape(ra, np.shape(x)), np.reshape(dec, np.shape(x))
 
 
 def sky_of(wcs, x, y):

@@ -62,6 +62,18 @@ def calibrate_command(
         str | None,
         typer.Option(metavar="NAME", help="Detector of all frames; default: from the headers."),
     ] = None,
+    exposure_key: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KEYWORD",
+            help="Header keyword that is the same for the detectors of one exposure; default: "
+            "EXPNUM, OBSID and the like, else the time it began.",
+        ),
+    ] = None,
+    no_camera: Annotated[
+        bool,
+        typer.Option("--no-camera", help="Detectors of one exposure know nothing of each other."),
+    ] = False,
     solution: Annotated[
         Path | None,
         typer.Option(
@@ -164,6 +176,8 @@ def calibrate_command(
         require_plotting("--report")
     if update and solution is None:
         raise InputError("--update needs the stored solution: --solution FILE")
+    if no_camera and exposure_key is not None:
+        raise InputError("--exposure-key ties detectors together, --no-camera keeps them apart")
     if jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     try:
@@ -184,7 +198,8 @@ def calibrate_command(
     except ValueError as err:
         raise InputError(str(err)) from err
 
-    loaded = [f for path in frames for f in read_frames(path, wcs=wcs, detector=detector)]
+    keys = {"exposure_keyword": exposure_key, "camera": not no_camera}
+    loaded = [f for path in frames for f in read_frames(path, wcs=wcs, detector=detector, **keys)]
     results = Results(output, loaded, overwrite=overwrite)
     if report:
         results.require_free("report.html")

@@ -8,7 +8,7 @@ import numpy as np
 from wpdc_gwcs.exceptions import WPDCWarning
 from wpdc_gwcs.io.headers import header_text, header_value
 
-__all__ = ["header_epoch"]
+__all__ = ["header_epoch", "header_start"]
 
 
 def header_epoch(headers, *, name="header"):
@@ -82,6 +82,28 @@ def header_epoch(headers, *, name="header"):
     return 2000.0 + (mid + _TO_TT.get(system, _TO_TT["UTC"]) / 86400.0 - 51544.5) / 365.25
 
 
+def header_start(headers):
+    """Find when an exposure began, if the headers tell the time of day.
+
+    Parameters
+    ----------
+    headers : sequence of `~astropy.io.fits.Header`
+        Looked through in turn for each keyword, the header of the image first.
+
+    Returns
+    -------
+    start : float or None
+        Modified Julian date as the headers give it, in whatever time system; `None` if there is no
+        date or nothing but the day, which many exposures share.
+    """
+    for key in ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG"):
+        for header in headers:
+            mjd = _mjd(header, key, whole_days=False) if key in header else None
+            if mjd is not None and _MJD_RANGE[0] < mjd < _MJD_RANGE[1]:
+                return mjd
+    return None
+
+
 _MJD_RANGE = (-5000.0, 105000.0)  # 1845 to 2146
 # Seconds to add for TT.  UTC has the leap seconds of today: a few too many for old plates.
 _TO_TT = {
@@ -104,8 +126,11 @@ _OLD_DATE = re.compile(r"(\d\d)/(\d\d)/(\d\d)")
 _CLOCK = re.compile(r"(\d{1,2}):(\d{1,2})(?::(\d{1,2}(?:\.\d*)?))?")
 
 
-def _mjd(header, key):
-    """Give the modified Julian date of a keyword, `None` if it is not a date."""
+def _mjd(header, key, *, whole_days=True):
+    """Give the modified Julian date of a keyword, `None` if it is not a date.
+
+    Without ``whole_days`` a date needs a time of day.
+    """
     value = header_value(header, key)
     if not key.startswith("DATE"):
         if isinstance(value, str):
@@ -116,7 +141,9 @@ def _mjd(header, key):
         if isinstance(value, bool) or not isinstance(value, int | float):
             return None
         # A zero stands for a date that was not filled in.
-        return None if value == 0 else value - 2400000.5 if key == "JD" else float(value)
+        if value == 0 or not (whole_days or value % 1):
+            return None
+        return value - 2400000.5 if key == "JD" else float(value)
     if not isinstance(value, str):
         return None
     clock = None
@@ -137,6 +164,8 @@ def _mjd(header, key):
             ),
             None,
         )
+    if clock is None and not whole_days:
+        return None
     try:
         days = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}") - np.datetime64("1858-11-17")
     except ValueError:

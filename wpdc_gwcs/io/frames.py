@@ -12,6 +12,7 @@ Headers are read at once and checked; pixels and source lists when they are need
 import functools
 import re
 import warnings
+from dataclasses import replace
 
 import numpy as np
 from astropy.io import fits
@@ -20,7 +21,8 @@ from astropy.table import Table
 from wpdc_gwcs.catalogs import table_format
 from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
 from wpdc_gwcs.frame import Frame
-from wpdc_gwcs.io.dates import header_epoch
+from wpdc_gwcs.io.dates import header_epoch, header_start
+from wpdc_gwcs.io.exposures import camera_key, exposure_key, has_identifier
 from wpdc_gwcs.io.files import (
     READ_ERRORS,
     file_kind,
@@ -63,10 +65,21 @@ _COMPANIONS = re.compile(
     r"|CON|CTX|D2IMARR|WCSDVARR|BACKGROUND|BKG|OOD)",
     re.IGNORECASE,
 )
+# Camera of frames that are tied to others and do not name theirs.
+_CAMERA = "camera"
 _NOT_NAMES = ("PRIMARY", "COMPRESSED_IMAGE", "")
 
 
-def read_frames(path, *, wcs=None, detector=None, name=None, image_shape=None):
+def read_frames(
+    path,
+    *,
+    wcs=None,
+    detector=None,
+    name=None,
+    image_shape=None,
+    exposure_keyword=None,
+    camera=True,
+):
     """Read the frames of a file.
 
     Parameters
@@ -84,6 +97,11 @@ def read_frames(path, *, wcs=None, detector=None, name=None, image_shape=None):
         Name of the frame instead of the file's.
     image_shape : (int, int), optional
         Shape ``(ny, nx)`` of the detector, where a source list or table does not tell.
+    exposure_keyword : str, optional
+        Keyword of the header whose value tells exposures apart, instead of those that are looked
+        for.
+    camera : bool, optional
+        Whether frames belong to a camera and an exposure; `False` leaves each on its own.
 
     Returns
     -------
@@ -94,7 +112,7 @@ def read_frames(path, *, wcs=None, detector=None, name=None, image_shape=None):
     ------
     FrameError
         If the file is missing, empty, damaged, truncated, not what its name says, or without a
-        celestial WCS.
+        celestial WCS, or lacks the keyword of the exposure.
 
     Warns
     -----
@@ -106,11 +124,16 @@ def read_frames(path, *, wcs=None, detector=None, name=None, image_shape=None):
     A frame is called like its file without endings; of several frames in a file, each has the name
     or the number of its extension appended.  The detector is that of ``DETECTOR``, ``DETNAME``,
     ``CCDNAME``, ``EXTNAME``, ... in this order; frames of one file are never one detector.
+
+    The camera is ``INSTRUME``, else ``TELESCOP``.  Frames of one camera are of one exposure if
+    ``EXPNUM``, ``OBSID`` or the like is the same or, where there is none, the time at which they
+    began; the frames of one file are so in any case, unless such an identifier differs.
     """
     path, extension = split_extension(path)
     stem = stem_of(path) if name is None else str(name)
     if file_kind(path, error=FrameError) != "fits":
-        return [_read_text_table(path, wcs, detector, stem, image_shape)]
+        frames = [_read_text_table(path, wcs, detector, stem, image_shape, exposure_keyword)]
+        return frames if camera else [_on_its_own(f) for f in frames]
     headers = None if wcs is None else _given_headers(wcs)
     with open_fits(path, error=FrameError) as hdus:
         chosen = _choose(hdus, path, extension)
@@ -137,8 +160,13 @@ def read_frames(path, *, wcs=None, detector=None, name=None, image_shape=None):
     frames = []
     for part in prepared:
         label = part["label"] if several else ""
-        frames.append(_frame_of(part, path, stem, label, detector, image_shape))
-    return _distinct(frames, prepared)
+        frames.append(_frame_of(part, path, stem, label, detector, image_shape, exposure_keyword))
+    frames = _distinct(frames, prepared)
+    if not camera:
+        return [_on_its_own(f) for f in frames]
+    if not several or exposure_keyword is not None:
+        return frames
+    return _of_one_exposure(frames, prepared, path)
 
 
 def _given_headers(wcs):
@@ -264,7 +292,7 @@ def _ldac_header(hdus, index, where):
     return headers[0]
 
 
-def _frame_of(part, path, stem, label, detector, image_shape):
+def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
     headers, where, index = part["headers"], part["where"], part["index"]
     loaders = {}
     if part["kind"] == "image":
@@ -283,9 +311,36 @@ def _frame_of(part, path, stem, label, detector, image_shape):
         source=where,
         gain=positive_number(headers, _GAIN_KEYS),
         saturation=positive_number(headers, _SATURATION_KEYS),
+        **_keys_of(headers, exposure_keyword, where),
         meta=_facts(headers),
         **loaders,
     )
+
+
+def _keys_of(headers, exposure_keyword, where):
+    """Find camera and exposure; a frame that does not tell its camera is on its own."""
+    exposure = exposure_key(headers, keyword=exposure_keyword, name=where)
+    camera = camera_key(headers)
+    if camera is None and exposure_keyword is not None:
+        camera = _CAMERA
+    return {"camera": camera, "exposure": None if camera is None else exposure}
+
+
+def _on_its_own(frame):
+    return replace(frame, camera=None, exposure=None)
+
+
+def _of_one_exposure(frames, parts, path):
+    """Tie the frames of a file, unless identifiers say that they are different exposures.
+
+    Their times need not be the same: each detector may have written its own.
+    """
+    frames = [replace(f, camera=f.camera or _CAMERA) for f in frames]
+    if len({f.exposure for f in frames}) == 1 and frames[0].exposure is not None:
+        return frames
+    if all(has_identifier(p["headers"]) for p in parts):
+        return frames
+    return [replace(f, exposure=str(path)) for f in frames]
 
 
 def _detector_of(headers):
@@ -304,14 +359,15 @@ def _facts(headers):
         text = next((t for h in headers for k in keys if (t := header_text(h, k))), "")
         if text:
             facts[fact] = text
-    exposure = positive_number(headers, ("EXPTIME", "EXPOSURE"))
-    return facts if exposure is None else facts | {"exptime": exposure}
+    numbers = {
+        "exptime": positive_number(headers, ("EXPTIME", "EXPOSURE")),
+        "start": header_start(headers),
+    }
+    return facts | {fact: n for fact, n in numbers.items() if n is not None}
 
 
 def _distinct(frames, parts):
     """Make names of frames and detectors of one file differ."""
-    from dataclasses import replace
-
     if len(frames) < 2:
         return frames
     if len({f.name for f in frames}) < len(frames):
@@ -372,7 +428,7 @@ def _load_fits_sources(path, index):
     return standardize_sources(needed, name=where)
 
 
-def _read_text_table(path, wcs, detector, stem, image_shape):
+def _read_text_table(path, wcs, detector, stem, image_shape, exposure_keyword):
     """Read a table of sources in any text format of astropy."""
     if wcs is None:
         raise FrameError(f"{path}: a table of sources needs a WCS header (--wcs)")
@@ -414,6 +470,7 @@ def _read_text_table(path, wcs, detector, stem, image_shape):
         epoch=epoch,
         source=str(path),
         load_sources=sources.copy,
+        **_keys_of([meta, header], exposure_keyword, str(path)),
         meta=_facts([meta, header]),
     )
 

@@ -44,6 +44,9 @@ The stages, in plain words:
    the frame promise either.  If a group fails, the next is tried; if all fail,
    `~wpdc_gwcs.exceptions.MatchError` says what was missing.
 
+Where the place of a frame is known to within a few star distances (from the other detectors of a
+camera), `match_nearby` needs no patterns and is content with as few stars as can prove anything.
+
 A blind search does all this for the eight ways to read the axes of the frame, with wider limits for
 pointing and scale.
 """
@@ -53,12 +56,14 @@ from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._evidence import AreaEvidence
 from wpdc_gwcs.matching._high_level import match_sources, pair_table, select_sources
 from wpdc_gwcs.matching._mapping import SmoothMap
+from wpdc_gwcs.matching._nearby import match_nearby
 from wpdc_gwcs.matching._pairs import pair_nearest
 
 __all__ = [
     "AreaEvidence",
     "MatchDiagnostics",
     "SmoothMap",
+    "match_nearby",
     "match_planes",
     "match_sources",
     "pair_nearest",
