@@ -14,11 +14,10 @@ together from the matched frames, each with a Gaussian prior whose width is lear
 that a prediction has an error: small between matched detectors, growing outward.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse
 
 from wpdc_gwcs.calibration.start import sky_of
 from wpdc_gwcs.models import deproject, project
@@ -38,11 +37,15 @@ _TERM_DEGREE = np.array([i + j for i, j in _TERMS])
 _FIELD = {2: 0.01, 3: 0.03, 4: 0.01, 5: 0.01, 6: 0.005, 7: 0.005}
 _PLACE, _TURN = 20.0, 1e-3
 _POINTING, _ATTITUDE = 1e4, 0.05
-# What no smooth field explains within a detector, px, at least.
-_LEAST_NOISE = 0.1
+# What no smooth field explains within a detector, px: more is a frame in the wrong place.
+_LEAST_NOISE, _MOST_NOISE = 0.1, 3.0
 _FIRST_NOISE = 1.0
-# Pairs from which on the residuals of a frame may have a curvature of their own.
-_FOR_QUADRATIC = 30
+# Pairs from which on nodes stand for them, which a quadratic polynomial reaches safely.
+_FOR_NODES = 30
+# Scatter of pairs, px: not less than round-off, nor than curvature that few pairs do not show.
+_LEAST_SCATTER, _SCATTER_OF_FEW = 0.02, 0.3
+# Frames that deviate by more standard errors than this count less.
+_DOUBTFUL = 3.0
 # Headers whose geometries differ by more than this, px, are not those of one camera.
 _DIFFERENT = 30.0
 _ROUNDS_OF_VARIANCES = 6
@@ -228,18 +231,15 @@ class Geometry:
         true = self.true_place(frame, *_node_pixels(frame))
         offset, matrix = self.attitudes[frame.exposure]
         t = np.linalg.solve(matrix, (true - offset).T).T
-        rows = np.zeros((len(at), len(self.covariance)))
-        _fill(rows, self.plane, self.columns, frame, at, self._linearized(frame, t))
-        s = rows @ self.covariance @ rows.T
+        first = self.linear[frame.exposure]
+        rows = _terms_of(self.plane, frame, at, first[0] + t @ first[1].T)
+        columns = _columns_of(self.columns, frame)
+        s = rows @ self.covariance[np.ix_(columns, columns)] @ rows.T
         common = max(float(s.mean()), 0.0)
         bend = max(float(np.trace(s)) / len(s) - common, 0.0)
         noise = self.widths.noise**2
         # the corners are 1.5 times as far out as the rms of the nodes
         return Prediction(self, frame, np.sqrt(common + noise), 1.5 * np.sqrt(bend + noise))
-
-    def _linearized(self, frame, t):
-        offset, matrix = self.linear[frame.exposure]
-        return offset + t @ matrix.T
 
 
 @dataclass(frozen=True)
@@ -366,15 +366,40 @@ def _place_terms(plane, detector, at):
     return np.column_stack([np.ones(len(at)), step])
 
 
-def _fill(rows, plane, columns, frame, at, t):
-    """Write the coefficients of the unknowns for positions of a frame: attitude - field - place."""
-    k = columns["exposures"][frame.exposure]
-    rows[:, k] = 1.0
-    rows[:, k + 1 : k + 3] = t / plane.radius
-    k = columns["field"]
-    rows[:, k : k + len(_TERMS)] = -_field_terms(plane, at)
-    k = columns["detectors"][frame.detector]
-    rows[:, k : k + 3] = -_place_terms(plane, frame.detector, at)
+def _terms_of(plane, frame, at, t):
+    """Coefficients of the unknowns that a frame depends on: field, attitude, place.
+
+    Attitude - field - place = header place - first guess; see `Geometry`.
+    """
+    attitude = np.column_stack([np.ones(len(at)), t / plane.radius])
+    place = _place_terms(plane, frame.detector, at)
+    return np.hstack([-_field_terms(plane, at), attitude, -place])
+
+
+def _columns_of(columns, frame):
+    """Where these unknowns are among all."""
+    attitude, place = columns["exposures"][frame.exposure], columns["detectors"][frame.detector]
+    return np.concatenate([np.arange(len(_TERMS)), attitude + np.arange(3), place + np.arange(3)])
+
+
+@dataclass(eq=False)
+class _Part:
+    """What one matched frame brings to a fit: rows of the design and what they should give."""
+
+    frame: object
+    at: np.ndarray
+    t: np.ndarray
+    variance: np.ndarray
+    design: np.ndarray = None
+    columns: np.ndarray = None
+    target: np.ndarray = None
+    doubt: float = 1.0  # factor of the errors of a frame that the others contradict
+    residual: np.ndarray = None
+
+    def weights(self, noise):
+        # the noise is that of the frame as a whole: many rows tell no more of it than three
+        common = max(1.0, len(self.at) / 3) * noise**2
+        return 1 / (self.doubt * np.sqrt(self.variance + common))
 
 
 def fit_focal_plane(plane, pairs, before=None):
@@ -394,94 +419,88 @@ def fit_focal_plane(plane, pairs, before=None):
     Geometry
         Field, places and attitudes with their covariance.
     """
-    names = [n for n in plane.frames if n in pairs]
-    exposures = list(dict.fromkeys(plane.frames[n].exposure for n in names))
-    detectors = list(plane.centers)
+    parts = [_part_of(plane, f, pairs[n], before) for n, f in plane.frames.items() if n in pairs]
+    exposures = list(dict.fromkeys(part.frame.exposure for part in parts))
+    first = len(_TERMS) + 3 * len(exposures)
     columns = {
-        "field": 0,
         "exposures": {e: len(_TERMS) + 3 * k for k, e in enumerate(exposures)},
-        "detectors": {d: len(_TERMS) + 3 * (len(exposures) + k) for k, d in enumerate(detectors)},
+        "detectors": {d: first + 3 * k for k, d in enumerate(plane.centers)},
     }
-    size = len(_TERMS) + 3 * (len(exposures) + len(detectors))
-    parts = [_nodes_of(plane, plane.frames[n], pairs[n], before) for n in names]
-    linear = _first_attitudes(plane, names, parts)
-    design = np.zeros((len(_NODES) * len(names), size))
-    target = np.zeros((len(design), 2))
-    variance = np.zeros(len(design))
-    for k, (name, (at, t, var)) in enumerate(zip(names, parts, strict=True)):
-        rows, frame = slice(k * len(_NODES), (k + 1) * len(_NODES)), plane.frames[name]
-        offset, matrix = linear[frame.exposure]
-        moved = offset + t @ matrix.T
-        _fill(design[rows], plane, columns, frame, at, moved)
-        target[rows], variance[rows] = at - moved, var
+    linear = _first_attitudes(plane, parts)
+    for part in parts:
+        offset, matrix = linear[part.frame.exposure]
+        moved = offset + part.t @ matrix.T
+        part.design = _terms_of(plane, part.frame, part.at, moved)
+        part.columns = _columns_of(columns, part.frame)
+        part.target = part.at - moved
     half = float(np.median(list(plane.halves.values())))
     widths = before.widths if before is not None else _first_widths(plane, half)
     for _ in range(_ROUNDS_OF_VARIANCES):
-        solution, covariance, residual = _solve(design, target, variance, widths, columns, plane)
-        widths = _learn(solution, covariance, residual, widths, columns, half, plane, names)
-    solution, covariance, residual = _solve(design, target, variance, widths, columns, plane)
+        solution, covariance = _solve(parts, widths, columns, plane)
+        deviations = _deviations(parts, widths, covariance)
+        for part in parts:
+            part.doubt = max(1.0, (deviations[part.frame.name][0] / _DOUBTFUL) ** 2)
+        widths = _learn(parts, solution, covariance, widths, columns, half)
+    solution, covariance = _solve(parts, widths, columns, plane)
     attitudes = {}
     for e, k in columns["exposures"].items():
         offset, matrix = linear[e]
         extra = solution[k + 1 : k + 3].T / plane.radius
-        attitudes[e] = (
-            offset + solution[k] + extra @ offset,
-            matrix + extra @ matrix,
-        )
-    geometry = Geometry(
+        attitudes[e] = offset + solution[k] + extra @ offset, matrix + extra @ matrix
+    return Geometry(
         plane=plane,
         attitudes=attitudes,
         field=solution[: len(_TERMS)],
         places={d: solution[k : k + 3] for d, k in columns["detectors"].items()},
         widths=widths,
-        deviations={},
+        deviations=_deviations(parts, widths, covariance),
         covariance=covariance,
         columns=columns,
         linear=linear,
     )
-    noise = variance + 3 * widths.noise**2
-    return replace(geometry, deviations=_deviations(names, design, residual, noise, covariance))
 
 
-def _nodes_of(plane, frame, pairs, before):
-    """Header and tangent-plane positions of the nodes of a matched frame, with their variance.
+def _part_of(plane, frame, pairs, before):
+    """Header and tangent-plane positions of the pairs of a frame, or of nodes that stand for many.
 
     What the prediction does not explain is smooth over the frame: a low-order polynomial through
-    the residuals of its pairs carries it to the nodes.
+    the residuals tells outliers from pairs, and carries many pairs to few nodes.
     """
     exposure = plane.exposures[frame.exposure]
-    nodes = _node_pixels(frame)
-    at = plane.header_place(frame, *nodes)
     sky = np.column_stack(project(pairs.ra, pairs.dec, exposure.crval)) / plane.scale
-    inverse = np.linalg.inv(exposure.matrix)
-    known, at_nodes = plane.header_place(frame, pairs.x, pairs.y), at
-    offset = exposure.offset
+    at = plane.header_place(frame, pairs.x, pairs.y)
+    nodes = _node_pixels(frame)
+    offset, matrix, known = exposure.offset, exposure.matrix, at
+    there = plane.header_place(frame, *nodes)
+    known_there = there
     if before is not None and frame.exposure in before.attitudes:
-        known, at_nodes = (before.true_place(frame, *p) for p in ((pairs.x, pairs.y), nodes))
         offset, matrix = before.attitudes[frame.exposure]
-        inverse = np.linalg.inv(matrix)
-    known, at_nodes = ((p - offset) @ inverse.T for p in (known, at_nodes))
+        known, known_there = (before.true_place(frame, *p) for p in ((pairs.x, pairs.y), nodes))
+    inverse = np.linalg.inv(matrix)
+    known, known_there = ((p - offset) @ inverse.T for p in (known, known_there))
     ny, nx = frame.image_shape
-    u, v = 2 * pairs.x / (nx - 1) - 1, 2 * pairs.y / (ny - 1) - 1
-    order = 2 if len(u) >= _FOR_QUADRATIC else 1
-    design, there = _low_order(u, v, order), _low_order(*_NODES.T, order)
-    # as at least one pixel of the frame's own for the few: three pairs always agree
-    ridge = np.diag([1e-6, *[1e-4] * (design.shape[1] - 1)])
-    keep = np.ones(len(u), bool)
+    many = len(at) >= _FOR_NODES
+    design = _low_order(2 * pairs.x / (nx - 1) - 1, 2 * pairs.y / (ny - 1) - 1, 2 if many else 1)
+    # keeps three pairs in a row from being a singular problem, and changes nothing else
+    ridge = 1e-4 * np.eye(design.shape[1])
+    keep = np.ones(len(at), bool)
     for _ in range(4):
         a, d = design[keep], (sky - known)[keep]
         inner = np.linalg.inv(a.T @ a + ridge)
         fit = inner @ (a.T @ d)
         left = np.hypot(*(sky - known - design @ fit).T)
-        sigma = max(0.85 * np.median(left[keep]), 0.02)
+        sigma = max(0.85 * np.median(left[keep]), _LEAST_SCATTER)
         new = left < 4 * sigma
-        if (new == keep).all() or new.sum() <= design.shape[1]:
+        if (new == keep).all() or new.sum() <= design.shape[1] + 1:
             break
         keep = new
-    leverage = np.einsum("ij,jk,ik->i", there, inner, there)
+    if not many:
+        sigma = max(sigma, _SCATTER_OF_FEW)
+        return _Part(frame, at[keep], sky[keep], np.full(keep.sum(), sigma**2))
+    low = _low_order(*_NODES.T, 2)
     # nine nodes tell no more than the terms of the fit
-    share = len(_NODES) / design.shape[1]
-    return at, at_nodes + there @ fit, share * sigma**2 * leverage
+    variance = len(_NODES) / low.shape[1] * sigma**2 * np.einsum("ij,jk,ik->i", low, inner, low)
+    return _Part(frame, there, known_there + low @ fit, variance)
 
 
 def _low_order(u, v, order):
@@ -489,24 +508,24 @@ def _low_order(u, v, order):
     return np.column_stack([one, u, v] + ([u * u, u * v, v * v] if order == 2 else []))
 
 
-def _first_attitudes(plane, names, parts):
+def _first_attitudes(plane, parts):
     """Robust linear mapping of each exposure from tangent to focal plane: median of the frames'."""
     groups = {}
-    for name, (at, t, _) in zip(names, parts, strict=True):
-        groups.setdefault(plane.frames[name].exposure, []).append((at, t))
+    for part in parts:
+        groups.setdefault(part.frame.exposure, []).append(part)
     linear = {}
     for exposure, group in groups.items():
         matrices = []
-        for at, t in group:
-            a, b = at - at.mean(axis=0), t - t.mean(axis=0)
+        for part in group:
+            a, b = part.at - part.at.mean(axis=0), part.t - part.t.mean(axis=0)
             matrices.append(np.linalg.lstsq(b, a, rcond=None)[0].T)
         matrix = np.median(matrices, axis=0)
         header = plane.exposures[exposure].matrix
         if np.abs(matrix @ np.linalg.inv(header) - np.eye(2)).max() < _ATTITUDE:
             # near enough: all exposures of one header then have the same scale
             matrix = header
-        offset = np.median([(at - t @ matrix.T).mean(axis=0) for at, t in group], axis=0)
-        linear[exposure] = offset, matrix
+        offsets = [(part.at - part.t @ matrix.T).mean(axis=0) for part in group]
+        linear[exposure] = np.median(offsets, axis=0), matrix
     return linear
 
 
@@ -515,7 +534,8 @@ def _first_widths(plane, half):
     return Widths(field, _PLACE, _TURN * half, _FIRST_NOISE)
 
 
-def _priors(widths, columns, plane, size):
+def _priors(widths, columns, plane):
+    size = len(_TERMS) + 3 * (len(columns["exposures"]) + len(columns["detectors"]))
     prior = np.empty(size)
     prior[: len(_TERMS)] = np.array(widths.field)[_TERM_DEGREE - 2]
     for k in columns["exposures"].values():
@@ -525,55 +545,59 @@ def _priors(widths, columns, plane, size):
     return prior
 
 
-def _solve(design, target, variance, widths, columns, plane):
-    """Posterior of all unknowns: means of both axes, covariance of one, residuals."""
-    prior = _priors(widths, columns, plane, design.shape[1])
-    # unknowns in units of their priors: well scaled, whatever they are
-    weight = 1 / np.sqrt(variance + 3 * widths.noise**2)
-    rows = scipy.sparse.csr_array(design * prior * weight[:, None])
-    normal = (rows.T @ rows).toarray()
-    normal[np.diag_indices_from(normal)] += 1.0
-    factor = scipy.linalg.cho_factor(normal)
-    inverse = scipy.linalg.cho_solve(factor, np.eye(len(normal)))
-    solution = (inverse @ (rows.T @ (target * weight[:, None]))) * prior[:, None]
-    covariance = inverse * prior * prior[:, None]
-    return solution, covariance, target - design @ solution
+def _solve(parts, widths, columns, plane):
+    """Posterior of all unknowns: means of both axes, covariance of one; residuals go to the parts.
+
+    Unknowns are in units of their priors: well scaled, whatever they are.
+    """
+    prior = _priors(widths, columns, plane)
+    normal, right = np.eye(len(prior)), np.zeros((len(prior), 2))
+    for part in parts:
+        weight = part.weights(widths.noise)[:, None]
+        rows = part.design * prior[part.columns] * weight
+        normal[np.ix_(part.columns, part.columns)] += rows.T @ rows
+        right[part.columns] += rows.T @ (part.target * weight)
+    inverse = scipy.linalg.cho_solve(scipy.linalg.cho_factor(normal), np.eye(len(normal)))
+    solution = (inverse @ right) * prior[:, None]
+    for part in parts:
+        part.residual = part.target - part.design @ solution[part.columns]
+    return solution, inverse * prior * prior[:, None]
 
 
-def _learn(solution, covariance, residual, widths, columns, half, plane, names):
+def _learn(parts, solution, covariance, widths, columns, half):
     """Widths of the priors from what they gave (EM); medians where a wrong frame must not count."""
     second = (solution**2).mean(axis=1) + np.diag(covariance)
     field = tuple(
         float(np.sqrt(second[: len(_TERMS)][_TERM_DEGREE == d].mean()))
         for d in range(2, _DEGREE + 1)
     )
-    seen = {plane.frames[n].detector for n in names}
-    starts = [columns["detectors"][d] for d in seen]
+    starts = [columns["detectors"][d] for d in {part.frame.detector for part in parts}]
     # 0.455 is the median of chi-square with one degree of freedom
-    place = np.sqrt(np.median([second[k] for k in starts]) / 0.455)
-    turn = np.sqrt(np.median([second[k + 1 : k + 3].mean() for k in starts]) / 0.455)
+    place = np.median([second[k] for k in starts]) / 0.455
+    turn = np.median([second[k + 1 : k + 3].mean() for k in starts]) / 0.455
     # with few detectors the first guess has its say, as five of them
     n = len(starts)
-    place = np.sqrt((n * place**2 + 5 * _PLACE**2) / (n + 5))
-    turn = np.sqrt((n * turn**2 + 5 * (_TURN * half) ** 2) / (n + 5))
-    frames = np.sqrt((residual.reshape(len(names), -1) ** 2).mean(axis=1))
-    noise = max(_LEAST_NOISE, 1.5 * float(np.median(frames)))
+    place = np.sqrt((n * place + 5 * _PLACE**2) / (n + 5))
+    turn = np.sqrt((n * turn + 5 * (_TURN * half) ** 2) / (n + 5))
+    scatter = np.median([np.sqrt((part.residual**2).mean()) for part in parts])
+    noise = float(np.clip(1.5 * scatter, _LEAST_NOISE, _MOST_NOISE))
     return Widths(field, float(place), float(turn), noise)
 
 
-def _deviations(names, design, residual, noise, covariance):
-    """How far each frame is from where the others predict it, sigma and px."""
-    weight = 1 / np.sqrt(noise)
-    n = len(_NODES)
+def _deviations(parts, widths, covariance):
+    """How far each frame is from where the others predict it, sigma and px, by name."""
     deviations = {}
-    for k, name in enumerate(names):
-        rows = slice(k * n, (k + 1) * n)
-        a = design[rows] * weight[rows, None]
-        r = residual[rows] * weight[rows, None]
-        hat = np.eye(n) - a @ covariance @ a.T
-        left_out = np.linalg.solve(hat + 1e-12 * np.eye(n), r)
-        # three numbers per axis, whatever the number of nodes
-        sigma = np.sqrt(max(float((r * left_out).sum()), 0.0) / 6)
-        shift = np.hypot(*(left_out / weight[rows, None]).mean(axis=0))
-        deviations[name] = sigma, float(shift)
+    for part in parts:
+        weight = part.weights(widths.noise)[:, None]
+        rows, residual = part.design * weight, part.residual * weight
+        inner = covariance[np.ix_(part.columns, part.columns)]
+        rest = (1 + 1e-9) * np.eye(len(rows)) - rows @ inner @ rows.T
+        inverse = np.linalg.inv(rest)
+        left_out = inverse @ residual
+        # variance of the frame without what doubt has added
+        spread = inverse - (1 - 1 / part.doubt**2 - 1e-9) * np.eye(len(rows))
+        # three numbers per axis, whatever the number of rows
+        sigma = np.sqrt(max(float((left_out * np.linalg.solve(spread, left_out)).sum()), 0.0) / 6)
+        shift = np.hypot(*np.median(left_out / weight, axis=0))
+        deviations[part.frame.name] = sigma, float(shift)
     return deviations

@@ -17,8 +17,8 @@ __all__ = ["match_nearby"]
 # A linear mapping follows any three pairs: the fourth is the first to prove anything.
 MIN_PAIRS = 4
 # Probability that chance alone gives as many pairs anywhere in the search: so low that a camera of
-# a hundred detectors, tried ten times over, is still wrong in less than one run of a thousand.
-_MAX_CHANCE = 1e-6
+# a hundred detectors is still wrong in less than one run of a thousand.
+_MAX_CHANCE = 1e-5
 # Stars that take part in the search for the shift: more would not make its peak clearer.
 _MOST_STARS = 300
 _MOST_OFFSETS = 400_000
@@ -50,7 +50,7 @@ class _Candidate:
 
 
 def match_nearby(
-    xs, ys, xr, yr, *, image_shape, max_shift, max_bend, flux=None, mag=None, min_pairs=MIN_PAIRS
+    xs, ys, xr, yr, *, image_shape, max_shift, max_bend, flux=None, mag=None, tiles=None
 ):
     r"""Pair sources with reference stars when a prediction says nearly where they are.
 
@@ -70,8 +70,9 @@ def match_nearby(
         Brightness of the sources.
     mag : (M,) array_like, optional
         Magnitudes of the reference stars.
-    min_pairs : int, optional
-        Fewer pairs are refused whatever they say.
+    tiles : ((N,) array_like, (M,) array_like), optional
+        Numbers of the exposures that sources and reference stars belong to, where those of several
+        are given that one mapping must suit; pairs are made within an exposure.
 
     Returns
     -------
@@ -96,19 +97,27 @@ def match_nearby(
     tried, at most :math:`(1 + s/r)^2 (1 + b/r)^4` for the shift s and the bend b allowed.
     """
     began = time.perf_counter()
-    sources, reference = np.column_stack([xs, ys]), np.column_stack([xr, yr])
-    if len(sources) < min_pairs or len(reference) < min_pairs:
+    local = np.column_stack([xs, ys]), np.column_stack([xr, yr])
+    sources, reference = local
+    if tiles is not None:
+        # side by side, further apart than any search reaches
+        step = np.array([100.0 * (max(image_shape) + max_shift + max_bend), 0.0])
+        sources, reference = (
+            p + np.asarray(t, float)[:, None] * step for p, t in zip(local, tiles, strict=True)
+        )
+    if len(sources) < MIN_PAIRS or len(reference) < MIN_PAIRS:
         raise MatchError(
             f"too few stars to match: {len(sources)} sources and {len(reference)} reference stars "
-            f"in reach, {min_pairs} are needed"
+            f"in reach, {MIN_PAIRS} are needed"
         )
     center = np.array([0.5 * (image_shape[1] - 1), 0.5 * (image_shape[0] - 1)])
     scale = 0.5 * np.hypot(*image_shape)
     tree = cKDTree(reference)
-    bright = _brightest(sources, flux), _brightest(reference, mag, inside=image_shape)
+    at = np.column_stack([np.ones(len(sources)), local[0] - center])
+    bright = _brightest(local[0], flux), _brightest(local[1], mag, inside=image_shape)
     candidates = []
     for shift, reach in _peaks(sources[bright[0]], reference[bright[1]], max_shift, max_bend):
-        grown = _grow(sources, reference, tree, center, scale, shift, reach, max_shift, max_bend)
+        grown = _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend)
         if grown is not None:
             candidates.append(grown)
     if not candidates:
@@ -116,7 +125,7 @@ def match_nearby(
     candidates.sort(key=lambda c: c.log_chance)
     best = candidates[0]
     n = len(best.pairs[0])
-    if n < min_pairs or best.log_chance > np.log(_MAX_CHANCE):
+    if n < MIN_PAIRS or best.log_chance > np.log(_MAX_CHANCE):
         raise MatchError(
             f"{n} pairs where the neighbours of the detector predict them, "
             f"{best.by_chance:.2g} expected by chance: not enough to be sure"
@@ -128,7 +137,7 @@ def match_nearby(
                 f"the match is ambiguous: {n} and {len(other.pairs[0])} pairs at two shifts that "
                 f"are {np.hypot(*(other.linear[0] - best.linear[0])):.3g} px apart"
             )
-    back = reference - best.linear[0]
+    back = local[1] - best.linear[0]
     on_frame = ((back > -0.5) & (back < np.array(image_shape[::-1]) - 0.5)).all(axis=1)
     n_reference = max(int(on_frame.sum()), n)
     size = 0.5 * max(image_shape)
@@ -215,9 +224,8 @@ def _peaks(sources, reference, max_shift, max_bend):
     return [(shift, max(width, min(max_bend, 2 * width))) for shift, width in chosen]
 
 
-def _grow(sources, reference, tree, center, scale, shift, reach, max_shift, max_bend):
+def _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend):
     """Grow a linear mapping from a shift, within bounds; `None` where it does not hold."""
-    at = np.column_stack([np.ones(len(sources)), sources - center])
     linear = np.zeros((3, 2))
     linear[0] = shift
     radius, scatter, before = reach, reach, None
