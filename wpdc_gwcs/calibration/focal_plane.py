@@ -45,7 +45,7 @@ _FOR_NODES = 30
 # Scatter of pairs, px: not less than round-off, nor than curvature that few pairs do not show.
 _LEAST_SCATTER, _SCATTER_OF_FEW = 0.02, 0.3
 # Frames that deviate by more standard errors than this count less.
-_DOUBTFUL = 3.0
+_DOUBTFUL = 4.0
 # Headers whose geometries differ by more than this, px, are not those of one camera.
 _DIFFERENT = 30.0
 _ROUNDS_OF_VARIANCES = 6
@@ -596,8 +596,8 @@ def _deviations(parts, widths, covariance):
         left_out = inverse @ residual
         # variance of the frame without what doubt has added
         spread = inverse - (1 - 1 / part.doubt**2 - 1e-9) * np.eye(len(rows))
-        # three numbers per axis, whatever the number of rows
-        sigma = np.sqrt(max(float((left_out * np.linalg.solve(spread, left_out)).sum()), 0.0) / 6)
+        # as if all of it were a shift, the one way in which wrong matches are wrong
+        sigma = np.sqrt(max(float((left_out * np.linalg.solve(spread, left_out)).sum()), 0.0) / 2)
         shift = np.hypot(*np.median(left_out / weight, axis=0))
         deviations[part.frame.name] = sigma, float(shift)
     return deviations

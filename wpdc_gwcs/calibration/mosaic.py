@@ -13,6 +13,7 @@ in the focal plane: what is left to search is so little that six pairs are proof
 
 import logging
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,7 +52,7 @@ _NARROWER = 0.8
 _FOR_FULL_MATCH = 8
 _MOST_ROUNDS = 60
 # A match that the other frames contradict: so many standard errors, px, and others that agree.
-_WRONG_SIGMA, _WRONG_SHIFT, _WITNESSES = 8.0, 5.0, 2
+_WRONG_SIGMA, _WRONG_SHIFT, _WITNESSES = 7.0, 5.0, 2
 _MOST_SUSPECTS = 5
 # A match so complete cannot be a chance: then the header is wrong, not the match.
 _BEYOND_DOUBT = 0.5
@@ -226,7 +227,7 @@ def _contradicted(plane, geometry, matched, known):
 
 def _task(frame, result, solution):
     sources = with_errors(result.sources)
-    if isinstance(solution, dict):
+    if isinstance(solution, Mapping):
         solution = solution.get(frame.detector)
     crpix = header_reference_point(frame) if solution is None else np.asarray(solution.crpix)
     return _Task(frame, sources, usable_sources(sources, frame.image_shape), crpix)
