@@ -8,7 +8,8 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 from wpdc_gwcs.calibration import MatchedFrame, Settings, calibrate, match_frame
-from wpdc_gwcs.calibration.focal_plane import LocalPairs, fit_focal_plane, focal_planes
+from wpdc_gwcs.calibration.focal_plane import focal_planes
+from wpdc_gwcs.calibration.geometry import LocalPairs, fit_geometry
 from wpdc_gwcs.calibration.matched import FailedFrame
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.catalogs import read_catalog
@@ -283,14 +284,14 @@ def test_a_known_place_makes_the_prediction_exact(stars):
     pairs = {f.name: true_pairs(f, *sky[f.exposure]) for f in frames if f.name != "e1_C3"}
     geometry = None
     for _ in range(3):
-        geometry = fit_focal_plane(plane, pairs, geometry)
+        geometry = fit_geometry(plane, pairs, geometry)
     frame = plane.frames["e1_C3"]
     prediction = geometry.predict(frame)
     assert prediction.shift < 0.3
     assert prediction_error(prediction, frame, *EXPOSURES[1]) < 0.1
     # nobody has seen the place of a detector: that is the error
     pairs = {n: p for n, p in pairs.items() if not n.endswith("C3")}
-    prediction = fit_focal_plane(plane, pairs).predict(frame)
+    prediction = fit_geometry(plane, pairs).predict(frame)
     assert 10 < prediction.shift < 40
     assert prediction_error(prediction, frame, *EXPOSURES[1]) < 3 * prediction.shift
 
@@ -299,7 +300,7 @@ def test_nothing_is_predicted_for_an_exposure_without_pairs(stars):
     frames = make_frames(stars[:10], EXPOSURES[:2])
     (plane,) = focal_planes(frames)
     pairs = {f.name: true_pairs(f, *EXPOSURES[0]) for f in frames if f.exposure == "0"}
-    assert fit_focal_plane(plane, pairs).predict(plane.frames["e1_C0"]) is None
+    assert fit_geometry(plane, pairs).predict(plane.frames["e1_C0"]) is None
 
 
 def test_headers_of_another_geometry_are_another_focal_plane(stars):

@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wpdc_gwcs.calibration.focal_plane import LocalPairs, fit_focal_plane, focal_planes
+from wpdc_gwcs.calibration.focal_plane import focal_planes
+from wpdc_gwcs.calibration.geometry import LocalPairs, fit_geometry
 from wpdc_gwcs.calibration.matched import (
     FailedFrame,
     MatchedFrame,
@@ -96,6 +97,13 @@ def start_from_neighbors(frames, results, catalog, settings=None, *, solution=No
         if _has_neighbors(members):
             for plane in focal_planes(members):
                 results.update(_solve(plane, results, catalog, settings, solution))
+                if len(plane.exposures) == 1:
+                    continue
+                # an exposure whose optics or places are not those of the others has only itself
+                for exposure in plane.exposures:
+                    part = plane.of(exposure)
+                    if any(isinstance(results[name], FailedFrame) for name in part.frames):
+                        results.update(_solve(part, results, catalog, settings, solution))
     return results
 
 
@@ -122,7 +130,7 @@ def _solve(plane, results, catalog, settings, solution):
         return {}
     doubted, tried, geometry, step = {}, {}, None, 0
     for _ in range(_MOST_ROUNDS):
-        geometry = fit_focal_plane(plane, _pairs_of(matched), geometry)
+        geometry = fit_geometry(plane, _pairs_of(matched), geometry)
         wrong = _contradicted(plane, geometry, matched, doubted)
         if wrong is not None:
             doubted[wrong] = matched.pop(wrong)
@@ -218,7 +226,7 @@ def _contradicted(plane, geometry, matched, known):
     pairs = _pairs_of(matched)
     disagreement = {}
     for _, name in sorted(suspects, reverse=True)[:_MOST_SUSPECTS]:
-        rest = fit_focal_plane(plane, {n: p for n, p in pairs.items() if n != name})
+        rest = fit_geometry(plane, {n: p for n, p in pairs.items() if n != name})
         # as sum of squares, in which no single frame counts for more than is sure to be wrong
         left = [min(sigma, 3 * _WRONG_SIGMA) ** 2 for sigma, _ in rest.deviations.values()]
         disagreement[name] = sum(left)

@@ -10,7 +10,7 @@ from scipy.special import gammaln
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._mapping import SmoothMap, scatter_of
-from wpdc_gwcs.matching._pairs import pair_nearest
+from wpdc_gwcs.matching._pairs import find_edges, one_to_one
 
 __all__ = ["match_nearby"]
 
@@ -57,7 +57,7 @@ def match_nearby(
     Parameters
     ----------
     xs, ys : (N,) array_like
-        Predicted positions of the sources, px, zero based.
+        Predicted positions of the sources, px, zero based; all are finite.
     xr, yr : (M,) array_like
         Positions of the reference stars in the same pixels.
     image_shape : (int, int)
@@ -79,7 +79,7 @@ def match_nearby(
     i_src, i_ref : (n,) ndarray of int
         Rows of the pairs.
     linear : (3, 2) ndarray
-        Mapping from predicted to reference pixels about the centre of the frame:
+        Mapping from predicted to reference pixels about the center of the frame:
         ``(1, x - x_c, y - y_c) @ linear`` is to be added.
     diagnostics : MatchDiagnostics
         Evidence.
@@ -121,13 +121,13 @@ def match_nearby(
         if grown is not None:
             candidates.append(grown)
     if not candidates:
-        raise MatchError("no pairs where the neighbours of the detector predict them")
+        raise MatchError("no pairs where the neighbors of the detector predict them")
     candidates.sort(key=lambda c: c.log_chance)
     best = candidates[0]
     n = len(best.pairs[0])
     if n < MIN_PAIRS or best.log_chance > np.log(_MAX_CHANCE):
         raise MatchError(
-            f"{n} pairs where the neighbours of the detector predict them, "
+            f"{n} pairs where the neighbors of the detector predict them, "
             f"{best.by_chance:.2g} expected by chance: not enough to be sure"
         )
     for other in candidates[1:]:
@@ -231,7 +231,7 @@ def _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend
     radius, scatter, before = reach, reach, None
     for _ in range(12):
         moved = sources + at @ linear
-        i, j, _ = pair_nearest(*moved.T, *reference.T, radius)
+        i, j, _ = _pair(moved, tree, radius)
         if len(i) == 0:
             return None
         linear = _fit(at[i], reference[j] - sources[i], scale)
@@ -249,7 +249,7 @@ def _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend
     if np.hypot(*linear[0]) > max_shift + radius or bend > max_bend + radius:
         return None
     moved = sources + at @ linear
-    i, j, n_ambiguous = pair_nearest(*moved.T, *reference.T, radius)
+    i, j, n_ambiguous = _pair(moved, tree, radius)
     if len(i) < 2:
         return None
     by_chance = _by_chance(moved, i, tree, radius)
@@ -263,6 +263,12 @@ def _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend
     return _Candidate(
         linear, (i, j), n_ambiguous, scatter, radius, by_chance, min(0.0, log_chance + trials)
     )
+
+
+def _pair(moved, tree, radius):
+    i, j, _ = find_edges(moved, tree, np.full(len(moved), radius))
+    keep, n_ambiguous = one_to_one(i, j, len(moved), tree.n)
+    return i[keep], j[keep], n_ambiguous
 
 
 def _terms(n):
