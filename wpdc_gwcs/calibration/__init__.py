@@ -8,8 +8,8 @@
 
 A frame is the unit of work: it is measured and matched alone (`match_frame`), in a process of its
 own with ``jobs > 1``.  Frames of a mosaic that cannot be matched alone are started from those of
-their exposure that can (`start_from_neighbors`).  The frames of one detector are then solved together, because they share one
-instrument (`solve_detector`).
+their exposure that can (`start_from_neighbors`).  The frames of one detector are then solved
+together, because they share one instrument (`solve_detector`).
 """
 
 from wpdc_gwcs.calibration.detector import solve_detector
