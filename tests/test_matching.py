@@ -17,7 +17,13 @@ from astropy.wcs.wcsapi import SlicedLowLevelWCS
 from gwcs import coordinate_frames as cf
 
 from wpdc_gwcs.exceptions import MatchError
-from wpdc_gwcs.matching import SmoothMap, match_planes, match_sources, pair_nearest
+from wpdc_gwcs.matching import (
+    SmoothMap,
+    match_nearby,
+    match_planes,
+    match_sources,
+    pair_nearest,
+)
 
 SHAPE = (2048, 2048)
 
@@ -740,3 +746,70 @@ def make_wcs(shape=SHAPE):
     wcs.wcs.cd = np.array([[-1.0, 0.02], [0.02, 1.0]]) * 0.2 / 3600
     wcs.wcs.radesys = "ICRS"
     return wcs
+
+
+# --- nearby: a prediction and few stars ---------------------------------------------------------
+
+
+def nearby_field(rng, n_sources, *, density=3e-4, shape=(1000, 1000), false=0):
+    """Few of the stars of a field, displaced a little, and sources that are none."""
+    reference = rng.uniform(-400, 1400, (rng.poisson(density * 1800**2), 2))
+    on = np.flatnonzero(((reference > 0) & (reference < 1000)).all(axis=1))
+    rows = rng.permutation(on)[:n_sources]
+    step = reference[rows] - 500
+    moved = reference[rows] + [31, -17] + step @ [[2e-3, 4e-3], [-4e-3, 2e-3]]
+    moved = moved + rng.normal(scale=0.05, size=moved.shape)
+    return np.vstack([moved, rng.uniform(0, 1000, (false, 2))]), reference, rows, shape
+
+
+@pytest.mark.parametrize(("n", "false"), [(6, 0), (8, 4), (60, 30), (250, 300)])
+def test_nearby_finds_few_stars(rng, n, false):
+    for _ in range(5):
+        sources, reference, rows, shape = nearby_field(rng, n, false=false)
+        i, j, linear, diagnostics = match_nearby(
+            *sources.T, *reference.T, image_shape=shape, max_shift=60, max_bend=6
+        )
+        right = (i < n) & (rows[np.minimum(i, n - 1)] == j)
+        assert right.sum() >= 0.9 * n
+        assert (~right).sum() <= 1 + 0.02 * false
+        np.testing.assert_allclose(linear[0], [-31, 17], atol=1.0)
+        assert diagnostics.n_pairs == len(i)
+        assert diagnostics.significance > 4.7  # P < 1e-5
+        x, y = diagnostics.mapping(*sources[i].T)
+        assert np.hypot(*(np.column_stack([x, y]) - reference[j]).T).max() < 1.0
+
+
+def test_nearby_is_not_deceived_by_chance(rng):
+    accepted = 0
+    for n in [4, 5, 6, 8, 12, 20, 50, 200] * 25:
+        _, reference, _, shape = nearby_field(rng, 1)
+        sources = rng.uniform(0, 1000, (n, 2))
+        try:
+            match_nearby(*sources.T, *reference.T, image_shape=shape, max_shift=80, max_bend=8)
+        except MatchError:
+            continue
+        accepted += 1
+    assert accepted == 0
+
+
+def test_nearby_needs_four_pairs_and_one_answer(rng):
+    sources, reference, _, shape = nearby_field(rng, 6)
+    options = {"image_shape": shape, "max_shift": 60, "max_bend": 6}
+    with pytest.raises(MatchError, match="too few stars to match: 3 sources"):
+        match_nearby(*sources[:3].T, *reference.T, **options)
+    twice = np.vstack([reference, reference + [9.0, 5.0]])
+    with pytest.raises(MatchError, match="ambiguous|not enough to be sure"):
+        match_nearby(*sources.T, *twice.T, **options)
+    with pytest.raises(MatchError, match="predict"):
+        match_nearby(*sources.T, *(reference + 5000).T, **options)
+
+
+def test_nearby_joins_exposures(rng):
+    fields = [nearby_field(rng, 4) for _ in range(4)]
+    sources, reference = (np.vstack([f[k] for f in fields]) for k in (0, 1))
+    tiles = [np.repeat(np.arange(4), [len(f[k]) for f in fields]) for k in (0, 1)]
+    _, _, linear, diagnostics = match_nearby(
+        *sources.T, *reference.T, image_shape=(1000, 1000), max_shift=60, max_bend=6, tiles=tiles
+    )
+    assert diagnostics.n_pairs >= 15
+    np.testing.assert_allclose(linear[0], [-31, 17], atol=0.3)

@@ -7,12 +7,14 @@
                                               '--- re-match ----'
 
 A frame is the unit of work: it is measured and matched alone (`match_frame`), in a process of its
-own with ``jobs > 1``.  The frames of one detector are then solved together, because they share one
-instrument (`solve_detector`).
+own with ``jobs > 1``.  Frames of a mosaic that cannot be matched alone are started from those of
+their exposure that can (`start_from_neighbors`).  The frames of one detector are then solved
+together, because they share one instrument (`solve_detector`).
 """
 
 from wpdc_gwcs.calibration.detector import solve_detector
 from wpdc_gwcs.calibration.matched import MatchedFrame, match_frame, measure_sources
+from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.run import CalibrationRun, calibrate
 from wpdc_gwcs.calibration.settings import Settings
 
@@ -24,4 +26,5 @@ __all__ = [
     "match_frame",
     "measure_sources",
     "solve_detector",
+    "start_from_neighbors",
 ]

@@ -16,7 +16,7 @@ __all__ = ["tie_exposures"]
 # two, and the next exposure does not begin before the first is read out.
 _SAME_START = 5.0
 # Detectors of one camera are not further apart than this, in diagonals of a detector: a camera of
-# 15 x 15, the largest there is, measures 14 between its outermost centres.
+# 15 x 15, the largest there is, measures 14 between its outermost centers.
 _FARTHEST = 20.0
 
 
@@ -97,7 +97,7 @@ def _by_place(frames, rows):
 
 
 def _place(frame):
-    """Direction of the centre of a frame by its header, and its diagonal in radians."""
+    """Direction of the center of a frame by its header, and its diagonal in radians."""
     ny, nx = frame.image_shape
     center = detector_center(frame.image_shape)
     x, y = center[0] + np.array([0.0, 0.5, 0.0]), center[1] + np.array([0.0, 0.0, 0.5])

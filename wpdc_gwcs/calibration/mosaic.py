@@ -13,11 +13,13 @@ in the focal plane: what is left to search is so little that six pairs are proof
 
 import logging
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wpdc_gwcs.calibration.focal_plane import LocalPairs, fit_focal_plane, focal_planes
+from wpdc_gwcs.calibration.focal_plane import focal_planes
+from wpdc_gwcs.calibration.geometry import LocalPairs, fit_geometry
 from wpdc_gwcs.calibration.matched import (
     FailedFrame,
     MatchedFrame,
@@ -43,13 +45,16 @@ _SHIFT_MARGIN, _BEND_MARGIN = 2.0, 1.0
 # Widest search, px, step by step: what is near a matched detector comes first, and tells of the
 # next; from the last on `match_planes` finds as much by itself.
 _STEPS = (40.0, 120.0, 360.0)
+# Error of a place common to several exposures that is left to each of them, px.
+_ALIKE = 4.0
 # A frame is tried again when the search has become narrower by this factor.
 _NARROWER = 0.8
 # From so many pairs on, the full match may go on from the narrow search.
 _FOR_FULL_MATCH = 8
 _MOST_ROUNDS = 60
 # A match that the other frames contradict: so many standard errors, px, and others that agree.
-_WRONG_SIGMA, _WRONG_SHIFT, _WITNESSES = 8.0, 5.0, 2
+_WRONG_SIGMA, _WRONG_SHIFT, _WITNESSES = 7.0, 5.0, 2
+_MOST_SUSPECTS = 5
 # A match so complete cannot be a chance: then the header is wrong, not the match.
 _BEYOND_DOUBT = 0.5
 
@@ -92,6 +97,13 @@ def start_from_neighbors(frames, results, catalog, settings=None, *, solution=No
         if _has_neighbors(members):
             for plane in focal_planes(members):
                 results.update(_solve(plane, results, catalog, settings, solution))
+                if len(plane.exposures) == 1:
+                    continue
+                # an exposure whose optics or places are not those of the others has only itself
+                for exposure in plane.exposures:
+                    part = plane.of(exposure)
+                    if any(isinstance(results[name], FailedFrame) for name in part.frames):
+                        results.update(_solve(part, results, catalog, settings, solution))
     return results
 
 
@@ -118,27 +130,23 @@ def _solve(plane, results, catalog, settings, solution):
         return {}
     doubted, tried, geometry, step = {}, {}, None, 0
     for _ in range(_MOST_ROUNDS):
-        geometry = fit_focal_plane(plane, _pairs_of(matched), geometry)
-        wrong = _contradicted(plane, geometry, set(doubted))
+        geometry = fit_geometry(plane, _pairs_of(matched), geometry)
+        wrong = _contradicted(plane, geometry, matched, doubted)
         if wrong is not None:
             doubted[wrong] = matched.pop(wrong)
             failed[wrong] = doubted[wrong]
             # what was learnt with it in the wrong place is to be learnt anew
             geometry = None
             continue
-        found = {}
-        for name, result in failed.items():
+        new = {}
+        for name in failed:
             prediction = geometry.predict(plane.frames[name])
             if prediction is None or _N_SIGMA * prediction.shift > _STEPS[step]:
                 continue
-            if prediction.shift > _NARROWER * tried.get(name, np.inf):
-                continue
-            tried[name] = prediction.shift
-            task = _task(plane.frames[name], result, solution)
-            try:
-                found[name] = _match(task, prediction, catalog, settings)
-            except MatchError as err:
-                log.debug("%s: %s", name, err)
+            if prediction.shift <= _NARROWER * tried.get(name, np.inf):
+                tried[name] = prediction.shift
+                new[name] = _task(plane.frames[name], failed[name], solution), prediction
+        found = _match_all(new, catalog, settings)
         for name in found:
             log.info("%s: matched from its neighbors", name)
             failed.pop(name)
@@ -152,6 +160,26 @@ def _solve(plane, results, catalog, settings, solution):
             matched_alone = before.diagnostics.completeness > _BEYOND_DOUBT
             results[name] = before if matched_alone else _refusal(before, geometry)
     return results | matched
+
+
+def _match_all(new, catalog, settings):
+    """Match frames about their predictions, one by one and then those of a detector together."""
+    found, left = {}, {}
+    for name, (task, prediction) in new.items():
+        try:
+            found[name] = _match(task, prediction, catalog, settings)
+        except MatchError as err:
+            log.debug("%s: %s", name, err)
+            left.setdefault(task.frame.detector, []).append((task, prediction))
+    have = {new[name][0].frame.detector for name in found}
+    for detector, tried in left.items():
+        # one that has been found once is predicted better in the next round
+        if detector not in have and len(tried) > 1:
+            try:
+                found |= _match_together(*zip(*tried, strict=True), catalog, settings)
+            except MatchError as err:
+                log.debug("%s: %s", detector, err)
+    return found
 
 
 def _can_be_tried(result):
@@ -178,20 +206,36 @@ def _pairs_of(matched):
     }
 
 
-def _contradicted(plane, geometry, known):
-    """Name of the matched frame that the others contradict most, or `None`."""
+def _contradicted(plane, geometry, matched, known):
+    """Name of the matched frame that the others contradict, or `None`.
+
+    A wrong frame makes others look wrong, above all the same detector in another exposure: the one
+    is wrong without which the rest agrees best.
+    """
     exposures = [plane.frames[n].exposure for n in geometry.deviations]
-    worst, most = None, _WRONG_SIGMA
-    for name, (sigma, shift) in geometry.deviations.items():
-        others = exposures.count(plane.frames[name].exposure) - 1
-        if sigma > most and shift > _WRONG_SHIFT and others >= _WITNESSES and name not in known:
-            worst, most = name, sigma
-    return worst
+    suspects = [
+        (sigma, name)
+        for name, (sigma, shift) in geometry.deviations.items()
+        if sigma > _WRONG_SIGMA
+        and shift > _WRONG_SHIFT
+        and exposures.count(plane.frames[name].exposure) > _WITNESSES
+        and name not in known
+    ]
+    if not suspects:
+        return None
+    pairs = _pairs_of(matched)
+    disagreement = {}
+    for _, name in sorted(suspects, reverse=True)[:_MOST_SUSPECTS]:
+        rest = fit_geometry(plane, {n: p for n, p in pairs.items() if n != name})
+        # as sum of squares, in which no single frame counts for more than is sure to be wrong
+        left = [min(sigma, 3 * _WRONG_SIGMA) ** 2 for sigma, _ in rest.deviations.values()]
+        disagreement[name] = sum(left)
+    return min(disagreement, key=disagreement.get)
 
 
 def _task(frame, result, solution):
     sources = with_errors(result.sources)
-    if isinstance(solution, dict):
+    if isinstance(solution, Mapping):
         solution = solution.get(frame.detector)
     crpix = header_reference_point(frame) if solution is None else np.asarray(solution.crpix)
     return _Task(frame, sources, usable_sources(sources, frame.image_shape), crpix)
@@ -215,44 +259,116 @@ class _Corrected:
         return self.start.sky(*self.pixels(x, y))
 
 
-def _match(task, prediction, catalog, settings):
-    """Match a frame about its prediction; `MatchError` without evidence."""
-    began = time.perf_counter()
-    frame, sources = replace(task.frame, wcs=prediction), task.sources
+@dataclass(frozen=True, eq=False)
+class _Stars:
+    """Both lists of a frame in the plane of its predicted start."""
+
+    start: object
+    reference: object
+    pick: np.ndarray
+    xs: np.ndarray
+    ys: np.ndarray
+    xr: np.ndarray
+    yr: np.ndarray
+    flux: np.ndarray | None
+    mag: np.ndarray | None
+
+
+def _stars(task, prediction, catalog, settings):
+    """Project sources and reference stars; `MatchError` where there are no reference stars."""
+    frame = replace(task.frame, wcs=prediction)
     start = linear_wcs(prediction, task.crpix)
     reference = reference_in_reach(frame, catalog, start, settings)
-    x, y = (np.asarray(sources[c], float) for c in ("x", "y"))
-    xs, ys = start.pixels(*sky_of(prediction, x, y))
+    xs, ys = start.pixels(*sky_of(prediction, task.sources["x"], task.sources["y"]))
     pick = np.flatnonzero(task.usable & np.isfinite(xs) & np.isfinite(ys))
-    ra, dec = (np.asarray(reference[c], float) for c in ("ra", "dec"))
-    xr, yr = start.pixels(ra, dec)
-    flux, mag = (
-        optional_column(sources, "flux", pick),
-        optional_column(reference, "phot_g_mean_mag"),
-    )
-    i_src, i_ref, linear, diagnostics = match_nearby(
+    return _Stars(
+        start,
+        reference,
+        pick,
         xs[pick],
         ys[pick],
-        xr,
-        yr,
-        image_shape=frame.image_shape,
-        max_shift=_N_SIGMA * prediction.shift + _SHIFT_MARGIN,
-        max_bend=_N_SIGMA * prediction.bend + _BEND_MARGIN,
-        flux=flux,
-        mag=mag,
+        *start.pixels(reference["ra"], reference["dec"]),
+        optional_column(task.sources, "flux", pick),
+        optional_column(reference, "phot_g_mean_mag"),
     )
-    center = 0.5 * (np.array(frame.image_shape[::-1]) - 1)
-    corrected = _Corrected(prediction, start, center, linear)
+
+
+def _center(frame):
+    return 0.5 * (np.array(frame.image_shape[::-1]) - 1)
+
+
+def _search(prediction):
+    """How far a search about a prediction must go, px."""
+    return {
+        "max_shift": _N_SIGMA * prediction.shift + _SHIFT_MARGIN,
+        "max_bend": _N_SIGMA * prediction.bend + _BEND_MARGIN,
+    }
+
+
+def _match_together(tasks, predictions, catalog, settings):
+    """Match the frames of one detector in several exposures, whose place is wrong for all alike.
+
+    Frames of too few stars, each for itself, are proof together: what is found for all of them is
+    the prediction for each.
+    """
+    stars = [_stars(t, p, catalog, settings) for t, p in zip(tasks, predictions, strict=True)]
+
+    def joined(name):
+        parts = [getattr(s, name) for s in stars]
+        return None if any(p is None for p in parts) else np.concatenate(parts)
+
+    searches = [_search(p) for p in predictions]
+    tiles = [
+        np.repeat(np.arange(len(stars)), [len(getattr(s, name)) for s in stars])
+        for name in ("xs", "xr")
+    ]
+    linear = match_nearby(
+        *(joined(name) for name in ("xs", "ys", "xr", "yr")),
+        image_shape=tasks[0].frame.image_shape,
+        flux=joined("flux"),
+        mag=joined("mag"),
+        tiles=tiles,
+        **{name: max(search[name] for search in searches) for name in searches[0]},
+    )[2]
+    found = {}
+    for task, prediction, star in zip(tasks, predictions, stars, strict=True):
+        corrected = _Corrected(prediction, star.start, _center(task.frame), linear)
+        try:
+            found[task.frame.name] = _match(
+                task, corrected, catalog, settings, max_shift=_ALIKE, max_bend=_ALIKE
+            )
+        except MatchError as err:
+            log.debug("%s: %s", task.frame.name, err)
+    return found
+
+
+def _match(task, prediction, catalog, settings, **search):
+    """Match a frame about its prediction; `MatchError` without evidence."""
+    began = time.perf_counter()
+    frame, sources = task.frame, task.sources
+    stars = _stars(task, prediction, catalog, settings)
+    i_src, i_ref, linear, diagnostics = match_nearby(
+        stars.xs,
+        stars.ys,
+        stars.xr,
+        stars.yr,
+        image_shape=frame.image_shape,
+        flux=stars.flux,
+        mag=stars.mag,
+        **(search or _search(prediction)),
+    )
+    corrected = _Corrected(prediction, stars.start, _center(frame), linear)
     start = linear_wcs(corrected, task.crpix)
     if len(i_src) >= _FOR_FULL_MATCH:
+        x, y = (np.asarray(sources[c], float)[stars.pick] for c in ("x", "y"))
         try:
             i_src, i_ref, diagnostics = match_planes(
-                *start.pixels(*sky_of(corrected, x[pick], y[pick])),
-                *start.pixels(ra, dec),
-                flux=flux,
-                mag=mag,
-                x_err=optional_column(sources, "x_err", pick),
-                y_err=optional_column(sources, "y_err", pick),
+                *start.pixels(*sky_of(corrected, x, y)),
+                *start.pixels(stars.reference["ra"], stars.reference["dec"]),
+                flux=stars.flux,
+                mag=stars.mag,
+                x_err=optional_column(sources, "x_err", stars.pick),
+                y_err=optional_column(sources, "y_err", stars.pick),
                 image_shape=frame.image_shape,
                 start=SmoothMap.identity(frame.image_shape),
             )
@@ -264,11 +380,11 @@ def _match(task, prediction, catalog, settings):
         source=frame.source,
         detector=frame.detector,
         image_shape=frame.image_shape,
-        wcs=task.frame.wcs,
+        wcs=frame.wcs,
         sources=sources,
         usable=task.usable,
-        reference=reference,
-        pairs=(pick[i_src], i_ref),
+        reference=stars.reference,
+        pairs=(stars.pick[i_src], i_ref),
         start=start,
         diagnostics=diagnostics,
         from_image=frame.load_image is not None,

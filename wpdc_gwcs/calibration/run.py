@@ -1,14 +1,15 @@
 """A whole run: every frame matched, every detector solved, one summary."""
 
 import time
+from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from wpdc_gwcs.calibration.detector import solve_detector
 from wpdc_gwcs.calibration.exposures import tie_exposures
@@ -16,7 +17,8 @@ from wpdc_gwcs.calibration.matched import FailedFrame, match_frame, measure_sour
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.catalogs import fill_motions
-from wpdc_gwcs.exceptions import FitError, FrameFailure, WPDCError
+from wpdc_gwcs.exceptions import FitError, FrameFailure, MatchError, WPDCError
+from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["CalibrationRun", "calibrate"]
@@ -112,8 +114,8 @@ def calibrate(
     catalog = fill_motions(catalog)
     frames = tie_exposures(frames)
 
-    results = _match_frames(frames, catalog, solution, settings, jobs, executor, progress)
-    results = start_from_neighbors(frames, results, catalog, settings, solution=solution)
+    common = {"catalog": catalog, "solution": solution, "settings": settings}
+    results = _match_exposures(frames, common, jobs, executor, progress)
     failures = {n: r.error for n, r in results.items() if isinstance(r, FailedFrame)}
     matched = [r for r in results.values() if not isinstance(r, FailedFrame)]
 
@@ -140,14 +142,55 @@ def calibrate(
     return CalibrationRun(ordered, solutions, failures, summary)
 
 
+def _match_exposures(frames, common, jobs, executor, progress):
+    """Match frames alone, then from their neighbors: frame name to `MatchedFrame` or error.
+
+    A blind search takes ten times as long, above all to find nothing: in an exposure of several
+    detectors it is left for those that neither they themselves nor their neighbors could match.
+    """
+    settings = common["settings"]
+    keys = [(f.camera, f.exposure) for f in frames]
+    counts = Counter(key for key in keys if None not in key)
+    tied = {f.name for f, key in zip(frames, keys, strict=True) if counts[key] > 1}
+    narrow = replace(settings, blind=False)
+    tasks = [_Task(f, narrow if f.name in tied else settings) for f in frames]
+    results = _match_frames(tasks, common, jobs, executor, progress)
+    results = start_from_neighbors(frames, results, **common)
+    if not (settings.blind and tied):
+        return results
+    tasks = [
+        _Task(f, settings, results[f.name].sources)
+        for f in frames
+        if f.name in tied
+        and isinstance(results[f.name], FailedFrame)
+        and isinstance(results[f.name].error, MatchError)
+    ]
+    if not tasks:
+        return results
+    again = _match_frames(tasks, common, jobs, executor, lambda stage, done, total: None)
+    if all(isinstance(result, FailedFrame) for result in again.values()):
+        return results | again
+    return start_from_neighbors(frames, results | again, **common)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """A frame to be matched, how, and its sources where they have been measured."""
+
+    frame: Frame
+    settings: Settings
+    sources: Table | None = None
+
+
 @one_blas_thread
-def _match_or_fail(frame, catalog, solution, settings):
+def _match_or_fail(task, catalog, solution):
     began = time.perf_counter()
-    sources = None
+    frame, sources = task.frame, task.sources
     try:
         stored = _stored_for(solution, frame)
-        sources = measure_sources(frame, settings)
-        return match_frame(frame, catalog, settings, sources=sources, solution=stored)
+        if sources is None:
+            sources = measure_sources(frame, task.settings)
+        return match_frame(frame, catalog, task.settings, sources=sources, solution=stored)
     except WPDCError as err:
         n_sources = 0 if sources is None else len(sources)
         return FailedFrame(err, n_sources, time.perf_counter() - began, sources)
@@ -161,33 +204,33 @@ def _start_worker(**common):
     _in_worker.update(common)
 
 
-def _match_in_worker(frame):
-    return _match_or_fail(frame, **_in_worker)
+def _match_in_worker(task):
+    return _match_or_fail(task, **_in_worker)
 
 
-def _match_frames(frames, catalog, solution, settings, jobs, executor, progress):
-    """Frame name to `MatchedFrame` or error, in the order of the frames."""
-    common = {"catalog": catalog, "solution": solution, "settings": settings}
+def _match_frames(tasks, common, jobs, executor, progress):
+    """Frame name to `MatchedFrame` or error, in the order of the tasks."""
+    common = {name: common[name] for name in ("catalog", "solution")}
     results = {}
 
     def collect(run):
-        for frame, result in zip(frames, run, strict=True):
-            results[frame.name] = result
-            progress("match", len(results), len(frames))
+        for task, result in zip(tasks, run, strict=True):
+            results[task.frame.name] = result
+            progress("match", len(results), len(tasks))
         return results
 
-    progress("match", 0, len(frames))
+    progress("match", 0, len(tasks))
     if executor is not None:
-        return collect(executor.map(partial(_match_or_fail, **common), frames))
-    if jobs == 1 or len(frames) == 1:
-        return collect(map(partial(_match_or_fail, **common), frames))
+        return collect(executor.map(partial(_match_or_fail, **common), tasks))
+    if jobs == 1 or len(tasks) == 1:
+        return collect(map(partial(_match_or_fail, **common), tasks))
     with ProcessPoolExecutor(
-        min(jobs, len(frames)),
+        min(jobs, len(tasks)),
         mp_context=get_context("spawn"),
         initializer=partial(_start_worker, **common),
     ) as pool:
         try:
-            return collect(pool.map(_match_in_worker, frames))
+            return collect(pool.map(_match_in_worker, tasks))
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

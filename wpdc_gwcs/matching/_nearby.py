@@ -10,15 +10,15 @@ from scipy.special import gammaln
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._mapping import SmoothMap, scatter_of
-from wpdc_gwcs.matching._pairs import pair_nearest
+from wpdc_gwcs.matching._pairs import find_edges, one_to_one
 
 __all__ = ["match_nearby"]
 
 # A linear mapping follows any three pairs: the fourth is the first to prove anything.
 MIN_PAIRS = 4
 # Probability that chance alone gives as many pairs anywhere in the search: so low that a camera of
-# a hundred detectors, tried ten times over, is still wrong in less than one run of a thousand.
-_MAX_CHANCE = 1e-6
+# a hundred detectors is still wrong in less than one run of a thousand.
+_MAX_CHANCE = 1e-5
 # Stars that take part in the search for the shift: more would not make its peak clearer.
 _MOST_STARS = 300
 _MOST_OFFSETS = 400_000
@@ -50,14 +50,14 @@ class _Candidate:
 
 
 def match_nearby(
-    xs, ys, xr, yr, *, image_shape, max_shift, max_bend, flux=None, mag=None, min_pairs=MIN_PAIRS
+    xs, ys, xr, yr, *, image_shape, max_shift, max_bend, flux=None, mag=None, tiles=None
 ):
     r"""Pair sources with reference stars when a prediction says nearly where they are.
 
     Parameters
     ----------
     xs, ys : (N,) array_like
-        Predicted positions of the sources, px, zero based.
+        Predicted positions of the sources, px, zero based; all are finite.
     xr, yr : (M,) array_like
         Positions of the reference stars in the same pixels.
     image_shape : (int, int)
@@ -70,15 +70,16 @@ def match_nearby(
         Brightness of the sources.
     mag : (M,) array_like, optional
         Magnitudes of the reference stars.
-    min_pairs : int, optional
-        Fewer pairs are refused whatever they say.
+    tiles : ((N,) array_like, (M,) array_like), optional
+        Numbers of the exposures that sources and reference stars belong to, where those of several
+        are given that one mapping must suit; pairs are made within an exposure.
 
     Returns
     -------
     i_src, i_ref : (n,) ndarray of int
         Rows of the pairs.
     linear : (3, 2) ndarray
-        Mapping from predicted to reference pixels about the centre of the frame:
+        Mapping from predicted to reference pixels about the center of the frame:
         ``(1, x - x_c, y - y_c) @ linear`` is to be added.
     diagnostics : MatchDiagnostics
         Evidence.
@@ -96,29 +97,37 @@ def match_nearby(
     tried, at most :math:`(1 + s/r)^2 (1 + b/r)^4` for the shift s and the bend b allowed.
     """
     began = time.perf_counter()
-    sources, reference = np.column_stack([xs, ys]), np.column_stack([xr, yr])
-    if len(sources) < min_pairs or len(reference) < min_pairs:
+    local = np.column_stack([xs, ys]), np.column_stack([xr, yr])
+    sources, reference = local
+    if tiles is not None:
+        # side by side, further apart than any search reaches
+        step = np.array([100.0 * (max(image_shape) + max_shift + max_bend), 0.0])
+        sources, reference = (
+            p + np.asarray(t, float)[:, None] * step for p, t in zip(local, tiles, strict=True)
+        )
+    if len(sources) < MIN_PAIRS or len(reference) < MIN_PAIRS:
         raise MatchError(
             f"too few stars to match: {len(sources)} sources and {len(reference)} reference stars "
-            f"in reach, {min_pairs} are needed"
+            f"in reach, {MIN_PAIRS} are needed"
         )
     center = np.array([0.5 * (image_shape[1] - 1), 0.5 * (image_shape[0] - 1)])
     scale = 0.5 * np.hypot(*image_shape)
     tree = cKDTree(reference)
-    bright = _brightest(sources, flux), _brightest(reference, mag, inside=image_shape)
+    at = np.column_stack([np.ones(len(sources)), local[0] - center])
+    bright = _brightest(local[0], flux), _brightest(local[1], mag, inside=image_shape)
     candidates = []
     for shift, reach in _peaks(sources[bright[0]], reference[bright[1]], max_shift, max_bend):
-        grown = _grow(sources, reference, tree, center, scale, shift, reach, max_shift, max_bend)
+        grown = _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend)
         if grown is not None:
             candidates.append(grown)
     if not candidates:
-        raise MatchError("no pairs where the neighbours of the detector predict them")
+        raise MatchError("no pairs where the neighbors of the detector predict them")
     candidates.sort(key=lambda c: c.log_chance)
     best = candidates[0]
     n = len(best.pairs[0])
-    if n < min_pairs or best.log_chance > np.log(_MAX_CHANCE):
+    if n < MIN_PAIRS or best.log_chance > np.log(_MAX_CHANCE):
         raise MatchError(
-            f"{n} pairs where the neighbours of the detector predict them, "
+            f"{n} pairs where the neighbors of the detector predict them, "
             f"{best.by_chance:.2g} expected by chance: not enough to be sure"
         )
     for other in candidates[1:]:
@@ -128,7 +137,7 @@ def match_nearby(
                 f"the match is ambiguous: {n} and {len(other.pairs[0])} pairs at two shifts that "
                 f"are {np.hypot(*(other.linear[0] - best.linear[0])):.3g} px apart"
             )
-    back = reference - best.linear[0]
+    back = local[1] - best.linear[0]
     on_frame = ((back > -0.5) & (back < np.array(image_shape[::-1]) - 0.5)).all(axis=1)
     n_reference = max(int(on_frame.sum()), n)
     size = 0.5 * max(image_shape)
@@ -215,15 +224,14 @@ def _peaks(sources, reference, max_shift, max_bend):
     return [(shift, max(width, min(max_bend, 2 * width))) for shift, width in chosen]
 
 
-def _grow(sources, reference, tree, center, scale, shift, reach, max_shift, max_bend):
+def _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend):
     """Grow a linear mapping from a shift, within bounds; `None` where it does not hold."""
-    at = np.column_stack([np.ones(len(sources)), sources - center])
     linear = np.zeros((3, 2))
     linear[0] = shift
     radius, scatter, before = reach, reach, None
     for _ in range(12):
         moved = sources + at @ linear
-        i, j, _ = pair_nearest(*moved.T, *reference.T, radius)
+        i, j, _ = _pair(moved, tree, radius)
         if len(i) == 0:
             return None
         linear = _fit(at[i], reference[j] - sources[i], scale)
@@ -241,7 +249,7 @@ def _grow(sources, reference, tree, center, scale, shift, reach, max_shift, max_
     if np.hypot(*linear[0]) > max_shift + radius or bend > max_bend + radius:
         return None
     moved = sources + at @ linear
-    i, j, n_ambiguous = pair_nearest(*moved.T, *reference.T, radius)
+    i, j, n_ambiguous = _pair(moved, tree, radius)
     if len(i) < 2:
         return None
     by_chance = _by_chance(moved, i, tree, radius)
@@ -255,6 +263,12 @@ def _grow(sources, reference, tree, center, scale, shift, reach, max_shift, max_
     return _Candidate(
         linear, (i, j), n_ambiguous, scatter, radius, by_chance, min(0.0, log_chance + trials)
     )
+
+
+def _pair(moved, tree, radius):
+    i, j, _ = find_edges(moved, tree, np.full(len(moved), radius))
+    keep, n_ambiguous = one_to_one(i, j, len(moved), tree.n)
+    return i[keep], j[keep], n_ambiguous
 
 
 def _terms(n):
