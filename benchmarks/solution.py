@@ -46,7 +46,7 @@ def find_lab():
 
 def pairs(truth, header, sources, ref, name, rng):
     """True pairs of one exposure as the solver takes them, some of them made wrong by a few px."""
-    from wpdc_gwcs.instrument import Exposure
+    from wpdc_gwcs.solve import Exposure
 
     true_id = np.asarray(sources["true_id"])
     real = true_id >= 0
@@ -76,10 +76,10 @@ def simulate(case, seed, **changes):
 
 
 def solve(truths, exposures, **options):
-    from wpdc_gwcs.instrument import solve_instrument
+    from wpdc_gwcs.solve import solve as solve_camera
 
     truth = truths[0]
-    return solve_instrument(
+    return solve_camera(
         exposures, image_shape=(truth.ny, truth.nx), crpix=(truth.x0, truth.y0), **options
     )
 
@@ -95,9 +95,7 @@ def calibration(fit, result):
     from wpdc_gwcs.solution import Calibration
 
     solution = result.solution if fit.pv is None else replace(result.solution, pv=fit.pv)
-    frame = Calibration(
-        fit.name, solution, fit.crval, fit.cd, fit.covariance, pv_covariance=fit.pv_covariance
-    )
+    frame = Calibration(fit.name, solution, fit.crval, fit.cd, field=fit.field, sigma=fit.sigma)
     return frame.wcs, frame
 
 
@@ -148,11 +146,11 @@ class TableClock:
     """Time spent choosing and building tables."""
 
     def __init__(self):
-        from wpdc_gwcs.instrument import _solver as solver
+        from wpdc_gwcs.solve import tables
 
         self.seconds = 0.0
         for name in ("choose_table", "build_lookup_table"):
-            setattr(solver, name, self._timed(getattr(solver, name)))
+            setattr(tables, name, self._timed(getattr(tables, name)))
 
     def _timed(self, function):
         def run(*args, **options):
@@ -187,7 +185,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", nargs="+", choices=LIMITS, default=list(LIMITS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1])
-    parser.add_argument("--refine", choices=("attitude", "pv", "auto"), default="attitude")
+    parser.add_argument("--refine", choices=("auto", "attitude", "field", "pv"), default="auto")
     parser.add_argument("--no-pulls", action="store_true", help="skip the second solution")
     parser.add_argument(
         "--scamp", choices=("none", "single", "all"), default="single", help="run SCAMP beside"

@@ -34,6 +34,7 @@ def make_calibration(
     table="cubic",
     degree=3,
     seed=1,
+    field=False,
 ):
     """A calibration with a distortion of some `amplitude` px and a table of some 0.1 px."""
     rng = np.random.default_rng(seed)
@@ -56,7 +57,6 @@ def make_calibration(
         crval=np.array(crval, float),
         pv=pv,
         lookup_table=lookup_table,
-        pv_covariance=np.stack([np.eye(len(total))] * 2) * 1e-9,
         table_sigma=None if lookup_table is None else np.full((3, 13, 12), 0.01),
         residual_map=ResidualMap.from_residuals(
             *rng.uniform(0, n, (2, 50)),
@@ -75,7 +75,12 @@ def make_calibration(
         solution=solution,
         crval=np.array(crval) + 0.001,
         cd=turn @ cd,
-        attitude_covariance=np.eye(6) * 1e-12,
+        field=LookupTable(np.linspace(x[0], x[-1], 4), y[::4], *rng.normal(size=(2, 4, 4)) * 0.01)
+        if field
+        else None,
+        sigma=rng.uniform(0.01, 0.02, (3, 17, 17)),
+        color_shift=rng.normal(size=(2, 3)) * [0.01, 1e-6, 1e-6],
+        reference_color=0.85,
         statistics={"rms_mas": np.float64(12.5)},
         settings={"refine": "attitude"},
         provenance={"frame": "e00.fits"},
@@ -116,19 +121,39 @@ def test_calibration_asdf_round_trip(tmp_path, calibration):
     x, y = grid(calibration)
     np.testing.assert_array_equal(back.wcs(x, y), calibration.wcs(x, y))
     np.testing.assert_array_equal(back.cd, calibration.cd)
-    np.testing.assert_array_equal(back.attitude_covariance, calibration.attitude_covariance)
+    np.testing.assert_array_equal(back.sigma, calibration.sigma)
+    np.testing.assert_array_equal(back.color_shift, calibration.color_shift)
+    assert back.reference_color == 0.85
+    assert back.field is None
     assert back.frame == "e00"
     assert back.solution.detector == "NE"
     assert back.solution.image_shape == (2064, 2048)
     np.testing.assert_array_equal(
         back.solution.lookup_table.dx, calibration.solution.lookup_table.dx
     )
-    np.testing.assert_array_equal(back.solution.pv_covariance, calibration.solution.pv_covariance)
+    np.testing.assert_array_equal(back.solution.table_sigma, calibration.solution.table_sigma)
     assert back.solution.residual_map is None  # the solution's own file has it
     assert back.statistics == {"rms_mas": 12.5}
     assert back.solution.settings == calibration.solution.settings
     assert back.solution.provenance["inputs"] == ["a.fits", "b.fits"]
     assert os.listdir(tmp_path) == ["e00.wcs.asdf"]
+
+
+@pytest.mark.parametrize("table", [None, "linear", "cubic"])
+def test_field_of_the_exposure(tmp_path, table):
+    """It is kept apart from the table of the instrument, and is in every WCS of the frame."""
+    calibration = make_calibration(table=table, field=True)
+    write(calibration, tmp_path / "a.wcs.asdf")
+    back = read(tmp_path / "a.wcs.asdf")
+    np.testing.assert_array_equal(back.field.dx, calibration.field.dx)
+    assert (back.solution.lookup_table is None) == (table is None)
+    x, y = grid(calibration)
+    np.testing.assert_array_equal(back.wcs(x, y), calibration.wcs(x, y))
+    plain = make_calibration(table=table)
+    assert 0.01 < distance(calibration, plain.wcs(x, y)) < 0.1
+    assert distance(calibration, read_wcs(tmp_path / "a.wcs.asdf")(x, y)) < 2e-4
+    write(calibration, tmp_path / "a.fits")
+    assert distance(calibration, read_wcs(tmp_path / "a.fits")(x, y)) < 2e-3
 
 
 def test_solution_asdf_round_trip(tmp_path, calibration):
@@ -174,9 +199,9 @@ def edited(path, tmp_path, edit):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("format_version", "1.1.0", "must not be newer than 1.0.0, got 1.1.0"),
-        ("format_version", "2.0.0", "must not be newer than 1.0.0, got 2.0.0"),
-        ("format_version", "new", "must be like '1.0.0', got 'new'"),
+        ("format_version", "1.2.0", "must not be newer than 1.1.0, got 1.2.0"),
+        ("format_version", "2.0.0", "must not be newer than 1.1.0, got 2.0.0"),
+        ("format_version", "new", "must be like '1.1.0', got 'new'"),
         ("kind", "map", "must be 'solution' or 'calibration', got 'map'"),
         ("cd", [[1.0, 2.0]], r"cd must be finite and of the shape \(2, 2\)"),
         ("crval", [1.0, float("nan")], "crval must be finite"),
@@ -633,6 +658,9 @@ def test_older_files_keep_opening():
             crval=calibration.crval,
             pv=calibration.solution.pv,
             pv_cd=calibration.solution.cd,
-            lookup_table=calibration.solution.lookup_table,
+            lookup_table=calibration.lookup_table,
         )
         np.testing.assert_array_equal(twin(x, y), calibration.wcs(x, y))
+        # Uncertainties came with version 1.1.0.
+        known = calibration.uncertainty(x, y)[0]
+        assert np.isfinite(known).all() != name.endswith("-1.0.0.asdf")

@@ -258,10 +258,21 @@ class TestBuildLookupTable:
         table, _ = build_lookup_table(make_map(rng), 20, method="linear")
         assert table.method == "linear"
 
+    def test_all_stars_in_a_few_bins(self, rng):
+        """They are enough, but say nothing of the rest of the detector."""
+        x, y = rng.uniform(0, 200, (2, 400))
+        corner = ResidualMap.from_residuals(
+            x, y, *rng.normal(0, 0.05, (2, 400)), x_err=0.05, y_err=0.05, image_shape=(2048, 2048)
+        )
+        for draft in (False, True):
+            table, info = build_lookup_table(corner, draft=draft)
+            assert table is None
+            assert info.choice.kernel == "none"
+
     def test_errors(self, rng):
         few = make_map(rng, 30)
         assert build_lookup_table(few)[0] is None
-        with pytest.raises(FitError, match="30 stars cannot carry a look-up table, 60 are needed"):
+        with pytest.raises(FitError, match="30 stars in .* bins cannot carry a look-up table, 60"):
             build_lookup_table(few, lut="always")
         with pytest.raises(FitError, match="no residual map"):
             build_lookup_table([])

@@ -54,25 +54,35 @@ def test_undistorted_pixels_are_those_of_the_linear_wcs(with_table):
     assert_allclose(with_table.undistort(x, y), expected, rtol=0, atol=1e-6)
 
 
-def test_attitude_and_table_add_up(with_table):
-    covariance = np.diag([0.03, 1e-5, 0.0, 0.04, 0.0, 2e-5]) ** 2
-    calibration = frame(with_table, attitude_covariance=covariance)
+def grid(*values, n=3):
+    """The same sigma_x, sigma_y and correlation everywhere."""
+    return np.stack([np.full((n, n), float(v)) for v in values])
+
+
+def test_uncertainty_is_that_of_the_frame(with_table):
+    """Its grid holds everything; that of the instrument is not added again."""
+    calibration = frame(with_table, sigma=grid(0.03, 0.04, -0.9))
     sigma_x, sigma_y, rho = calibration.uncertainty([999.5, 1499.5], [499.5, 499.5])
-    assert_allclose(sigma_x[0], np.hypot(0.01, 0.03))
-    assert_allclose(sigma_y[0], np.hypot(0.02, 0.04))
-    assert_allclose(rho[0], 0.5 * 0.01 * 0.02 / (sigma_x[0] * sigma_y[0]))
-    # 500 px away, where the PV polynomial hardly matters.
-    assert_allclose(sigma_x[1], np.sqrt(0.01**2 + 0.03**2 + (500e-5) ** 2), rtol=1e-3)
-    assert_allclose(sigma_y[1], sigma_y[0], rtol=1e-3)
-
-
-def test_correlated_attitude(with_table):
-    covariance = np.zeros((6, 6))
-    covariance[np.ix_([0, 3], [0, 3])] = 1e-2 * np.array([[1, -0.9], [-0.9, 1]])
-    table = replace(with_table, table_sigma=np.zeros((3, 5, 6)))
-    rho = frame(table, attitude_covariance=covariance).uncertainty(100.0, 200.0)[2]
+    assert_allclose(sigma_x, 0.03)
+    assert_allclose(sigma_y, 0.04)
     assert_allclose(rho, -0.9)
-    nothing = frame(table, attitude_covariance=np.zeros((6, 6))).uncertainty(100.0, 200.0)
+
+
+def test_uncertainty_is_interpolated(solution):
+    """Linear between the nodes, from one outer edge of the detector to the other."""
+    sigma = grid(0.01, 0.02, 0.0)
+    sigma[0, :, 2] = 0.05  # right edge
+    sigma[1, 0, :] = 0.06  # lower edge
+    sigma_x, sigma_y, rho = frame(solution, sigma=sigma).uncertainty(
+        [1999.5, 999.5, 1499.5, 0.0], [300.0, 499.5, 499.5, 249.5]
+    )
+    assert_allclose(sigma_x, [0.05, 0.01, 0.03, 0.01])
+    assert_allclose(sigma_y[1:], [0.02, 0.02, 0.04])
+    assert_allclose(rho, 0)
+
+
+def test_nothing_is_uncertain(solution):
+    nothing = frame(solution, sigma=grid(0, 0, 0)).uncertainty(100.0, 200.0)
     assert_allclose(nothing, [0, 0, 0])
 
 
@@ -83,40 +93,8 @@ def test_table_uncertainty_is_interpolated(with_table):
     assert_allclose(np.sqrt(table.covariance(199.5, 300.0)[0, 0]), 0.03)
 
 
-def test_polynomial_uncertainty_without_table(solution):
-    """Against brute force: random coefficients, attitudes fitted over the detector."""
-    rng = np.random.default_rng(2)
-    sigma = np.array([1e-6, 1e-5, 1e-5, *[3e-4] * 3, *[1e-2] * 4]) * 0.03
-    stored = replace(solution, pv_covariance=np.array([np.diag(sigma**2)] * 2))
-    x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 1999, 15), np.linspace(0, 999, 15)))
-    plane = np.stack([np.ones_like(x), x, y], axis=1)
-    xi, eta = CD @ (np.array([x, y]) - [[999.5], [499.5]])
-    found = []
-    for _ in range(400):
-        coefficients = solution.pv.coefficients + rng.normal(size=(2, 10)) * sigma
-        moved = PVPolynomial.from_coefficients(coefficients)
-        error = np.linalg.solve(CD, np.array(moved(xi, eta)) - solution.pv(xi, eta))
-        found.append(error - (plane @ np.linalg.lstsq(plane, error.T, rcond=None)[0]).T)
-    found = np.array(found)
-    calibration = frame(stored, attitude_covariance=np.zeros((6, 6)))
-    sigma_x, sigma_y, rho = calibration.uncertainty(x, y)
-    # 400 trials: 3.5 %.
-    assert_allclose(np.std(found, axis=0) / [sigma_x, sigma_y], 1.0, atol=0.15)
-    direct = np.mean(found[:, 0] * found[:, 1], axis=0) / (found.std(0)[0] * found.std(0)[1])
-    assert_allclose(rho, direct, atol=0.2)
-
-
-def test_own_polynomial(with_table):
-    covariance = np.zeros((2, 10, 10))
-    covariance[:, 0, 0] = (1e-4 * 0.05) ** 2
-    plain = replace(with_table, cd=1e-4 * np.eye(2))
-    calibration = frame(plain, pv_covariance=covariance)
-    sigma_x, sigma_y, _ = calibration.uncertainty(700.0, 100.0)
-    assert_allclose([sigma_x, sigma_y], [np.hypot(0.05, 0.01), np.hypot(0.05, 0.02)])
-
-
 def test_shapes_and_edges(with_table):
-    calibration = frame(with_table, attitude_covariance=1e-6 * np.eye(6))
+    calibration = frame(with_table, sigma=grid(0.01, 0.02, 0.1))
     for shape in ((), (3,), (2, 3), (0,)):
         for value in calibration.uncertainty(np.full(shape, 5.0), np.full(shape, 6.0)):
             assert value.shape == shape
@@ -131,7 +109,79 @@ def test_shapes_and_edges(with_table):
 
 
 def test_unknown_is_nan(solution, with_table):
+    """A frame without a grid of its own, as of files of format version 1.0.0."""
     assert np.isnan(frame(with_table).uncertainty(5.0, 5.0)[0])
-    known = {"attitude_covariance": np.eye(6)}
-    assert np.isnan(frame(solution, **known).uncertainty(5.0, 5.0)[0])
-    assert np.isnan(frame(replace(with_table, table_sigma=None), **known).uncertainty(5.0, 5.0)[0])
+    assert np.isnan(solution.covariance(5.0, 5.0)).all()
+
+
+class TestField:
+    """Table of the instrument and field of the exposure together."""
+
+    @pytest.fixture
+    def both(self, solution):
+        x, y = np.linspace(-0.5, 1999.5, 21), np.linspace(-0.5, 999.5, 13)
+        u, v = np.meshgrid(x / 2000, y / 1000)
+        table = LookupTable(x, y, np.sin(6 * u * v), np.cos(5 * u))
+        x, y = np.linspace(-0.5, 1999.5, 9), np.linspace(-0.5, 999.5, 8)
+        u, v = np.meshgrid(x / 2000, y / 1000)
+        # Cubic: splines on the nodes of the table take it exactly.
+        field = LookupTable(x, y, 0.2 * u**3 - 0.1 * v, 0.3 * u * v**2)
+        return table, field, replace(solution, lookup_table=table)
+
+    def test_are_subtracted_one_after_the_other(self, both, rng):
+        table, field, solution = both
+        calibration = frame(solution, field=field)
+        x, y = rng.uniform(0, 1999, 50), rng.uniform(0, 999, 50)
+        expected = np.subtract(solution.undistort(x, y), field(x, y))
+        assert_allclose(calibration.undistort(x, y), expected, rtol=0, atol=1e-9)
+        assert_allclose(calibration.lookup_table(x, y), np.add(table(x, y), field(x, y)), atol=1e-9)
+        # The instrument itself is as before.
+        assert_allclose(calibration.solution.lookup_table(x, y), table(x, y))
+
+    def test_one_of_them_alone(self, both, solution):
+        table, field, instrument = both
+        assert frame(solution).lookup_table is None
+        assert frame(solution, field=field).lookup_table is field
+        assert frame(instrument).lookup_table is table
+
+    def test_round_trip(self, both):
+        calibration = frame(both[2], field=both[1])
+        x, y = np.array([3.0, 1000.0, 1990.0]), np.array([990.0, 500.0, 7.0])
+        assert_allclose(calibration.wcs.invert(*calibration.wcs(x, y)), [x, y], atol=1e-6)
+
+
+class TestColor:
+    SHIFT = np.array([[0.1, 2e-5, -1e-5], [-0.2, 1e-5, 3e-5]])
+
+    def test_moves_the_undistorted_place(self, with_table):
+        """A star redder by 0.5 mag at the same pixel comes from that much further on the plane."""
+        calibration = frame(with_table, color_shift=self.SHIFT, reference_color=0.8)
+        other = calibration.at_color(1.3)
+        x, y = np.meshgrid([0.0, 700.0, 1999.0], [0.0, 999.0])
+        place = np.array(calibration.undistort(x, y)) - np.array([999.5, 499.5])[:, None, None]
+        rows = np.stack([np.ones_like(x), *place])
+        moved = place + 0.5 * np.tensordot(self.SHIFT, rows, axes=1)
+        linear = WCS(naxis=2)
+        linear.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+        linear.wcs.crpix, linear.wcs.cd, linear.wcs.crval = [1, 1], CD, [11.0, 21.0]
+        expected = linear.all_pix2world(*moved, 0)
+        # 0.1 px of another tangent point: third order.
+        assert_allclose(other.wcs(x, y), expected, rtol=0, atol=1e-4 * 1e-3)
+        assert other.reference_color == 1.3
+        assert_allclose(calibration.crval, (11.0, 21.0))
+
+    def test_there_and_back(self, with_table):
+        calibration = frame(with_table, color_shift=self.SHIFT, reference_color=0.8)
+        assert calibration.at_color(0.8).wcs(5.0, 6.0) == calibration.wcs(5.0, 6.0)
+        back = calibration.at_color(2.8).at_color(0.8)
+        # The second step starts from the matrix of the first: 2 mag of 3e-5 squared, 1000 px.
+        assert_allclose(back.wcs(5.0, 6.0), calibration.wcs(5.0, 6.0), rtol=0, atol=1e-4 * 1e-2)
+
+    def test_no_color_no_shift(self, with_table):
+        calibration = frame(with_table)
+        assert calibration.at_color(3.0) is calibration
+
+    @pytest.mark.parametrize("color", [np.nan, np.inf])
+    def test_must_be_a_number(self, with_table, color):
+        with pytest.raises(ValueError, match="color must be a finite number, got"):
+            frame(with_table).at_color(color)

@@ -56,7 +56,19 @@ class MatchError(FrameFailure):
 
 
 class FitError(FrameFailure):
-    """The distortion or the attitude could not be determined from the matches."""
+    """Pairs that cannot determine what is fitted.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong.
+    reasons : dict, optional
+        Name of each frame to its own reason, where several failed together.
+    """
+
+    def __init__(self, message="", *, reasons=None):
+        super().__init__(message)
+        self.reasons = reasons or {}
 
 
 class WPDCWarning(AstropyUserWarning):

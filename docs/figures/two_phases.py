@@ -19,8 +19,9 @@ from matplotlib.figure import Figure
 
 from wpdc_gwcs import Calibration, simulate
 from wpdc_gwcs.evaluation import binned_residuals, compare_weights, tabulate_weights
-from wpdc_gwcs.instrument import Exposure, solve_instrument
 from wpdc_gwcs.plotting import plot_weights
+from wpdc_gwcs.solve import Exposure
+from wpdc_gwcs.solve import solve as solve_exposures
 
 IMAGES = Path(__file__).resolve().parent.parent / "images"
 SHAPE = (4096, 4096)
@@ -52,7 +53,7 @@ def make(n, density, seed):
 
 
 def solve(exposures, **options):
-    return solve_instrument(exposures, image_shape=SHAPE, crpix=CENTRE, **options)
+    return solve_exposures(exposures, image_shape=SHAPE, crpix=CENTRE, **options)
 
 
 def calibrations(exposures, result):
@@ -64,7 +65,9 @@ def calibrations(exposures, result):
              "dx": f.dx, "dy": f.dy, "used": f.used}
         )  # fmt: skip
         found.append(
-            Calibration(f.name, solution, f.crval, f.cd, f.covariance, matches=matches)
+            Calibration(
+                f.name, solution, f.crval, f.cd, field=f.field, sigma=f.sigma, matches=matches
+            )
         )  # fmt: skip
     return found
 

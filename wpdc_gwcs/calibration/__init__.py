@@ -8,11 +8,11 @@
 
 A frame is the unit of work: it is measured and matched alone (`match_frame`), in a process of its
 own with ``jobs > 1``.  Frames of a mosaic that cannot be matched alone are started from those of
-their exposure that can (`start_from_neighbors`).  The frames of one detector are then solved
-together, because they share one instrument (`solve_detector`).
+their exposure that can (`start_from_neighbors`).  The frames of one camera are then solved
+together, because they share its detectors and exposures (`solve_camera`).
 """
 
-from wpdc_gwcs.calibration.detector import solve_detector
+from wpdc_gwcs.calibration.camera import solve_camera
 from wpdc_gwcs.calibration.matched import MatchedFrame, match_frame, measure_sources
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.run import CalibrationRun, calibrate
@@ -25,6 +25,6 @@ __all__ = [
     "calibrate",
     "match_frame",
     "measure_sources",
-    "solve_detector",
+    "solve_camera",
     "start_from_neighbors",
 ]

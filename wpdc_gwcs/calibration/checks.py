@@ -1,60 +1,85 @@
-"""Does a solution agree with its own stars?  One that does not is never delivered."""
+"""Whether a solution agrees with its own stars, and what it lacks.
+
+A solution that contradicts its stars is never delivered; one that lacks something is delivered as
+degraded, with the reasons.
+"""
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
-from wpdc_gwcs.evaluation import binned_residuals, evaluate
+from wpdc_gwcs.evaluation import binned_residuals
 from wpdc_gwcs.exceptions import FitError
 
-__all__ = ["check_solution"]
+__all__ = ["check_solution", "shortcomings"]
 
-_MIN_STARS = 10
-_MAX_SIGMA = 1.0  # px
+# Stars that agree with a solution: six numbers from fewer are at the mercy of one wrong pair, but
+# for a detector whose place other frames know.
+_MIN_STARS, _MIN_STARS_KNOWN = 10, 4
+
+# Residuals of right pairs, px, but for centroids as bad as that.
+_MAX_SIGMA = 1.0
+_MAX_OVER_ERRORS = 3.0
 
 # Frames of one detector years apart differ by a tenth of a pixel in places: that is in their
-# statistics, and no reason to refuse them.
+# statistics, and no reason to doubt them.
 _MAX_OFFSET = 0.25  # px
 
 # Bad seeing makes centroids worse than those a stored solution was made of, but not this much.
 _STORED_RATIO = 5.0
 
+# The stars' outline covers so much of the detector; random stars do from about 35 on.
+_MIN_COVERAGE = 0.7
 
-def check_solution(frame, matches, instrument, *, stored=None):
-    """Raise an error unless the solution of a frame agrees with its stars, everywhere.
+# Uncertainty of the map, px, and the share of the detector that may exceed it.
+_MAX_MAP_SIGMA, _UNCERTAIN_SHARE = 0.25, 0.05
+
+# Share of the matched stars that the fit uses, and of the stars of the shorter list that match.
+_MIN_USED, _MIN_COMPLETENESS = 0.7, 0.3
+
+# Change of area by which a map may differ from its mean; beyond, it comes close to folding.
+_MIN_AREA, _MAX_AREA = 0.5, 2.0
+
+
+def check_solution(frame, calibration, *, stored=None, known=False):
+    """Raise an error where the solution of a frame contradicts its stars.
 
     Parameters
     ----------
     frame : MatchedFrame
         The frame, for its shape and for messages.
-    matches : `~astropy.table.Table`
-        Columns ``x``, ``y``, residuals ``dx``, ``dy`` in px, and ``used``.
-    instrument : DistortionSolution
-        The distortion the frame was solved with.
+    calibration : Calibration
+        With matches and statistics.
     stored : DistortionSolution, optional
         The stored solution, where the frame had to take its distortion as it is.
+    known : bool, optional
+        Whether other detectors or a stored solution know the place of this one.
 
     Raises
     ------
     FitError
-        If too few stars agree, they scatter too much, a part of the frame is off as a whole, or the
-        map folds.
+        If too few stars agree, they scatter far beyond their errors, or not as those of the stored
+        solution.
 
     Notes
     -----
     The pairs have been tested against chance before; what is tested here is the map.
     """
-    used = np.asarray(matches["used"])
-    dx, dy = np.asarray(matches["dx"]), np.asarray(matches["dy"])
-    statistics = evaluate(dx[used], dy[used])
-    if statistics.n < _MIN_STARS:
+    statistics = calibration.statistics
+    residuals = statistics["residuals"]
+    least = _MIN_STARS_KNOWN if known else _MIN_STARS
+    if statistics["n_used"] < least:
         raise FitError(
-            f"{frame.source}: {statistics.n} stars agree with the solution, at least "
-            f"{_MIN_STARS} must"
+            f"{frame.source}: {statistics['n_used']} stars agree with the solution, at least "
+            f"{least} must"
         )
-    sigma = max(statistics.sigma_dx, statistics.sigma_dy)
-    if not sigma <= _MAX_SIGMA:
+    used = np.asarray(calibration.matches["used"])
+    sigma = max(residuals["sigma_dx"], residuals["sigma_dy"])
+    errors = [np.asarray(calibration.matches[c], float)[used] for c in ("x_err", "y_err")]
+    typical = float(np.median(errors))
+    if sigma > max(_MAX_SIGMA, _MAX_OVER_ERRORS * typical):
         raise FitError(
-            f"{frame.source}: the residuals scatter by {sigma:.2f} px, at most {_MAX_SIGMA} px are "
-            "accepted"
+            f"{frame.source}: the residuals scatter by {sigma:.2f} px, at most {_MAX_SIGMA} px, or "
+            f"{_MAX_OVER_ERRORS:g} times their errors of {typical:.2f} px, are accepted"
         )
     expected = None if stored is None else stored.statistics.get("sigma_px")
     if expected is not None and sigma > max(_STORED_RATIO * expected, _MAX_OFFSET):
@@ -62,33 +87,108 @@ def check_solution(frame, matches, instrument, *, stored=None):
             f"{frame.source}: the residuals scatter by {sigma:.2f} px, those of the stored "
             f"solution by {expected:.2f} px: it is not that of this detector, or no longer"
         )
+
+
+def shortcomings(frame, calibration, *, held, known=False):
+    """List what a delivered solution lacks.
+
+    Parameters
+    ----------
+    frame : MatchedFrame
+        The frame.
+    calibration : Calibration
+        With matches, uncertainty and statistics.
+    held : (N,) ndarray of bool
+        Matches that were held out on purpose.
+    known : bool, optional
+        Whether other detectors or a stored solution know the distortion.
+
+    Returns
+    -------
+    list of str
+        Reasons, each with its figure; none for a solution that is as good as can be wished.
+    """
+    reasons = []
     ny, nx = frame.image_shape
+    matches = calibration.matches
+    used = np.asarray(matches["used"])
+    x, y = np.asarray(matches["x"], float)[used], np.asarray(matches["y"], float)[used]
+    share = coverage(x, y, frame.image_shape)
+    if share < _MIN_COVERAGE and not known:
+        reasons.append(
+            f"its {used.sum()} stars span {share:.0%} of the detector (x {x.min():.0f} to "
+            f"{x.max():.0f} of {nx} px, y {y.min():.0f} to {y.max():.0f} of {ny})"
+        )
+    sigma = np.max(np.asarray(calibration.sigma)[:2], axis=0)
+    uncertain = float(np.mean(~(sigma <= _MAX_MAP_SIGMA)))
+    if uncertain > _UNCERTAIN_SHARE:
+        reasons.append(
+            f"the map is uncertain by more than {_MAX_MAP_SIGMA} px over {uncertain:.0%} of the "
+            f"detector, by {np.max(sigma):.2g} px at worst"
+        )
+    n = int(np.sum(~held))
+    if used.sum() < _MIN_USED * n:
+        reasons.append(f"{used.sum()} of {n} matched stars agree with the solution")
+    match = frame.diagnostics
+    if match.completeness < _MIN_COMPLETENESS:
+        reasons.append(
+            f"{match.n_pairs} of {match.n_sources} clean detections and {match.n_reference} "
+            "reference stars on the frame match"
+        )
+    if frame.epoch is None and "pmra" in frame.reference.colnames:
+        reasons.append("the frame has no epoch: the stars' motions could not be applied")
+    low, high = _area_range(calibration, nx, ny)
+    if not (low >= _MIN_AREA and high <= _MAX_AREA):
+        reasons.append(f"the map stretches the detector by {low:.2f} to {high:.2f} in area")
+    offset = _offset_of_parts(matches, used, frame.image_shape, calibration.statistics)
+    if offset is not None:
+        reasons.append(offset)
+    return reasons
+
+
+def coverage(x, y, image_shape):
+    """Share of a detector within the outline of some stars.
+
+    Parameters
+    ----------
+    x, y : (N,) array_like
+        Their pixels.
+    image_shape : (int, int)
+        Shape ``(ny, nx)``.
+
+    Returns
+    -------
+    float
+        Area of their convex hull over that of the detector.
+    """
+    if len(x) < 3:
+        return 0.0
+    try:
+        return float(ConvexHull(np.stack([x, y], axis=1)).volume / np.prod(image_shape))
+    except QhullError:
+        return 0.0
+
+
+def _area_range(calibration, nx, ny):
+    """Smallest and largest area of a pixel over the detector, relative to the middle value."""
     x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, 33), np.linspace(-0.5, ny - 0.5, 33))
-    ux, uy = instrument.undistort(x, y)
+    ux, uy = calibration.undistort(x, y)
     area = np.gradient(ux, axis=1) * np.gradient(uy, axis=0)
     area -= np.gradient(ux, axis=0) * np.gradient(uy, axis=1)
-    area /= (nx / 32) * (ny / 32)
-    if not np.all((area > 0.5) & (area < 2.0)):
-        raise FitError(
-            f"{frame.source}: the solution stretches the detector by {np.nanmin(area):.2f} to "
-            f"{np.nanmax(area):.2f} in area, 0.5 to 2 is accepted: the stars do not determine the "
-            "distortion everywhere"
-        )
-    mean_dx, mean_dy, count = binned_residuals(
-        np.asarray(matches["x"])[used],
-        np.asarray(matches["y"])[used],
-        dx[used],
-        dy[used],
-        image_shape=frame.image_shape,
-        n_bins=4,
-    )
+    area /= np.median(area)
+    return float(area.min()), float(area.max())
+
+
+def _offset_of_parts(matches, used, image_shape, statistics):
+    """Tell of parts of the frame that are off as a whole, or None."""
+    sigma = max(statistics["residuals"]["sigma_dx"], statistics["residuals"]["sigma_dy"])
+    columns = [np.asarray(matches[c], float)[used] for c in ("x", "y", "dx", "dy")]
+    mean_dx, mean_dy, count = binned_residuals(*columns, image_shape=image_shape, n_bins=4)
     settled = count >= 10
     noise = 6 * sigma / np.sqrt(np.where(settled, count, 1))
     limit = np.maximum(noise, max(3 * sigma, _MAX_OFFSET))
     off = settled & (np.hypot(mean_dx, mean_dy) > limit)
-    if off.any():
-        worst = np.nanmax(np.hypot(mean_dx, mean_dy)[off])
-        raise FitError(
-            f"{frame.source}: {off.sum()} of {settled.sum()} parts of the frame are off by up to "
-            f"{worst:.2f} px"
-        )
+    if not off.any():
+        return None
+    worst = np.nanmax(np.hypot(mean_dx, mean_dy)[off])
+    return f"{off.sum()} of {settled.sum()} parts of the frame are off by up to {worst:.2f} px"

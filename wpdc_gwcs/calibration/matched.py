@@ -64,6 +64,7 @@ class MatchedFrame:
     seconds: float
     exposure: str | None = None  # as in `Frame`: with others of the camera, or on its own
     camera: str | None = None
+    epoch: float | None = None
 
     @property
     def n_sources(self):
@@ -230,6 +231,7 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
         seconds=time.perf_counter() - began,
         exposure=frame.exposure,
         camera=frame.camera,
+        epoch=frame.epoch,
     )
 
 

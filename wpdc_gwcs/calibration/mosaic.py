@@ -391,4 +391,5 @@ def _match(task, prediction, catalog, settings, **search):
         seconds=time.perf_counter() - began,
         exposure=frame.exposure,
         camera=frame.camera,
+        epoch=frame.epoch,
     )

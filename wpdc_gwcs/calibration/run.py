@@ -11,13 +11,13 @@ from multiprocessing import get_context
 import numpy as np
 from astropy.table import QTable, Table
 
-from wpdc_gwcs.calibration.detector import solve_detector
+from wpdc_gwcs.calibration.camera import cameras_of, solve_camera
 from wpdc_gwcs.calibration.exposures import tie_exposures
 from wpdc_gwcs.calibration.matched import FailedFrame, match_frame, measure_sources
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.catalogs import fill_motions
-from wpdc_gwcs.exceptions import FitError, FrameFailure, MatchError, WPDCError
+from wpdc_gwcs.exceptions import FitError, MatchError, WPDCError
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.threads import one_blas_thread
 
@@ -120,23 +120,22 @@ def calibrate(
     matched = [r for r in results.values() if not isinstance(r, FailedFrame)]
 
     solutions, calibrations = {}, {}
-    detectors = list(dict.fromkeys(frame.detector for frame in matched))
+    groups = cameras_of(matched)
     holdout = _holdout_mask(catalog, settings)
-    for k, detector in enumerate(detectors):
-        progress("solve", k, len(detectors))
-        group = [frame for frame in matched if frame.detector == detector]
-        stored = _stored_of(solution, detector)
-        try:
-            solved, found, failed = solve_detector(
-                group, settings, holdout=holdout, solution=stored, update=update
-            )
-        except FrameFailure as err:
-            failures.update({frame.name: err for frame in group})
-            continue
-        solutions[detector] = solved
+    for k, group in enumerate(groups):
+        progress("solve", k, len(groups))
+        stored = {
+            name: _stored_of(solution, name)
+            for name in {frame.detector for frame in group}
+            if _stored_of(solution, name) is not None
+        }
+        solved, found, failed = solve_camera(
+            group, settings, holdout=holdout, solution=stored, update=update
+        )
+        solutions |= solved
         calibrations.update({c.frame: c for c in found})
         failures.update(failed)
-    progress("solve", len(detectors), len(detectors))
+    progress("solve", len(groups), len(groups))
     ordered = [calibrations[n] for n in names if n in calibrations]
     summary = _summarize(frames, results, calibrations, failures)
     return CalibrationRun(ordered, solutions, failures, summary)
@@ -276,8 +275,10 @@ def _summarize(frames, results, calibrations, failures):
             "detector": frame.detector,
             "camera": frame.camera or "",
             "exposure": frame.exposure or "",
-            "status": "failed" if found is None else "solved",
-            "reason": " ".join(str(failures[frame.name]).split()) if found is None else "",
+            "status": "failed" if found is None else found.statistics["status"],
+            "reason": " ".join(str(failures[frame.name]).split())
+            if found is None
+            else "; ".join(found.statistics["reasons"]),
             "n_sources": result.n_sources,
             "n_matched": 0 if found is None else found.statistics["n_matched"],
         }

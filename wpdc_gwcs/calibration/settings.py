@@ -9,7 +9,7 @@ __all__ = ["Settings"]
 _CHOICES = {
     "centroids": ("psf", "windowed", "given"),
     "reference_point": ("header", "center", "nearest-source"),
-    "refine": ("auto", "attitude", "pv"),
+    "refine": ("auto", "attitude", "field", "pv"),
     "lut": ("auto", "none"),
 }
 
@@ -30,9 +30,13 @@ class Settings:
         Nodes of the look-up table along each axis.
     lut : {'auto', 'none'}, optional
         ``auto`` keeps a table where it lowers the cross-validated residual.
-    refine : {'auto', 'attitude', 'pv'}, optional
-        What is fitted per exposure: six linear numbers (``attitude``), the polynomial too
-        (``pv``), or whichever predicts left-out stars better (``auto``).
+    refine : {'auto', 'attitude', 'field', 'pv'}, optional
+        What an exposure has of its own: six linear numbers (``attitude``), also a smooth field
+        where its evidence is there (``auto``) or in any case (``field``), or a polynomial
+        (``pv``, the paper's way).
+    degree : int or 'auto', optional
+        Degree of the delivered polynomial and largest degree of a detector's own distortion, 1 to
+        7; ``auto``: up to 7 by evidence, delivered as a cubic and a table.
     centroids : {'psf', 'windowed', 'given'}, optional
         How positions are measured on images; source lists are always taken as given.
     reference_point : {'header', 'center', 'nearest-source'}, optional
@@ -55,7 +59,8 @@ class Settings:
     r0: float | None = None
     n_grid: int = 50
     lut: str = "auto"
-    refine: str = "attitude"
+    refine: str = "auto"
+    degree: int | str = "auto"
     centroids: str = "psf"
     reference_point: str = "header"
     threshold: float = 5.0
@@ -71,6 +76,8 @@ class Settings:
                 raise ValueError(
                     f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
                 )
+        if self.degree != "auto" and self.degree not in range(1, 8):
+            raise ValueError(f"degree must be 'auto' or 1 to 7, got {self.degree!r}")
         if not 4 <= self.n_grid <= 1000:
             raise ValueError(f"n_grid must be between 4 and 1000, got {self.n_grid}")
         if not 0 <= self.holdout <= 0.9:

@@ -86,11 +86,18 @@ def calibrate_command(
     refine: Annotated[
         str,
         typer.Option(
-            metavar="{auto,attitude,pv}",
-            help="What is fitted per exposure: six linear numbers, its own polynomial too, or what "
-            "predicts left-out stars better.",
+            metavar="{auto,attitude,field,pv}",
+            help="What an exposure has of its own: six linear numbers (attitude), also a smooth "
+            "field where its evidence is there (auto) or always (field), or a polynomial (pv).",
         ),
-    ] = "attitude",
+    ] = "auto",
+    degree: Annotated[
+        str,
+        typer.Option(
+            metavar="{auto,1...7}",
+            help="Degree of the polynomial; auto: by evidence, delivered as a cubic and a table.",
+        ),
+    ] = "auto",
     lut: Annotated[
         str,
         typer.Option(
@@ -187,6 +194,7 @@ def calibrate_command(
             n_grid=n_grid,
             lut=lut,
             refine=refine,
+            degree=int(degree) if degree.isdigit() else degree,
             centroids=centroids,
             reference_point=reference_point,
             threshold=threshold,

@@ -5,22 +5,24 @@
     {"wcs": gwcs in stock models,
      "wpdc": {format_version, kind, ...}}
 
-Layout of ``wpdc``, format version 1.0.0 (arrays are core ASDF arrays, all else plain YAML):
+Layout of ``wpdc``, format version 1.1.0 (arrays are core ASDF arrays, all else plain YAML):
 
 ======================= ========================================================================
-``format_version``      "1.0.0"
+``format_version``      "1.1.0"
 ``kind``                "solution" or "calibration"
 ``software``            name and version of the writer
 ``solution``            the instrument, see below
 ``frame``               of a calibration: name of the frame, and with it ``crval``, ``cd``,
-                        ``attitude_covariance``, ``statistics``, ``settings``, ``provenance``
+                        ``field`` (a table like ``lookup_table``, or null), ``sigma``,
+                        ``color_shift``, ``reference_color``, ``statistics``, ``settings``,
+                        ``provenance``
 ======================= ========================================================================
 
 ``solution`` has ``detector``, ``image_shape`` (ny, nx), ``crpix`` (zero based), ``cd``, ``crval``,
 ``pv`` (``degree``, ``radial``, ``indices``, ``coefficients``), ``lookup_table`` (``method``,
-``x_grid``, ``y_grid``, ``dx``, ``dy``) or null, ``pv_covariance``, ``table_sigma``,
-``residual_map`` (solution files only), ``statistics``, ``settings``, ``provenance``.  Matches and
-sources have tables of their own.
+``x_grid``, ``y_grid``, ``dx``, ``dy``) or null, ``table_sigma``, ``residual_map`` (solution files
+only), ``statistics``, ``settings``, ``provenance``.  Matches and sources have tables of their own.
+Files of version 1.0.0 open; the uncertainties of their frames are not known any more.
 """
 
 import dataclasses
@@ -39,7 +41,7 @@ from wpdc_gwcs.solution import Calibration, DistortionSolution
 
 __all__ = ["FORMAT_VERSION", "read_asdf", "read_asdf_wcs", "write_asdf", "write_stock"]
 
-FORMAT_VERSION = "1.0.0"
+FORMAT_VERSION = "1.1.0"
 # Tables with files of their own, and what only the file of the detector itself needs.
 _NOT_STORED = {"matches", "sources"}
 _NOT_IN_FRAMES = {"residual_map"}
@@ -301,6 +303,7 @@ def _read_table(tree):
 _READERS = {
     "pv": _read_pv,
     "lookup_table": _read_table,
+    "field": _read_table,
     "residual_map": ResidualMap.from_tree,
     "image_shape": lambda shape: tuple(int(n) for n in shape),
 }

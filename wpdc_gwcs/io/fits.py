@@ -170,9 +170,8 @@ def write_cpdis(obj, path, *, overwrite=False):
     as well, for an exact way back.
     """
     header = tpv_header(obj)
-    solution = _parts(obj)[0]
     _require_shape(obj)
-    table = solution.lookup_table
+    table = obj.lookup_table
     hdus, worst, factor = [fits.PrimaryHDU(header=header)], np.inf, 1
     while table is not None and worst > _CPDIS_TOLERANCE:
         grids = [
@@ -420,7 +419,7 @@ def _read_table(hdu, name):
 def _own_hdus(obj):
     """Make the tables that bring the instrument back exactly."""
     solution = _parts(obj)[0]
-    pv, table = solution.pv, solution.lookup_table
+    pv, table = solution.pv, obj.lookup_table
     values = {
         "CRPIX": ("2D", "pixel", solution.crpix),
         "CD": ("4D", "deg/pixel", solution.cd),
@@ -555,7 +554,7 @@ def _prior_shift(obj, x, y):
     pv = fold_attitude(solution.pv, _relative(cd, solution.cd))
     shape = x.shape
     offset = np.array([x.ravel(), y.ravel()]) - np.asarray(solution.crpix)[:, None]
-    shift_behind = np.array(solution.lookup_table(x.ravel(), y.ravel()))
+    shift_behind = np.array(obj.lookup_table(x.ravel(), y.ravel()))
     u = cd @ offset
     target = np.array(pv(*u)) - cd @ shift_behind
     v = u.copy()

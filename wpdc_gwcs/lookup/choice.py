@@ -19,6 +19,7 @@ from wpdc_gwcs.lookup._smoother import (
 __all__ = [
     "MIN_STARS_TABLE",
     "best_of",
+    "carries_table",
     "choose_table",
     "first_choice",
     "first_choices",
@@ -46,8 +47,27 @@ _N_SHORTLIST = 4
 # Stars per bin below which bins are joined further for the choice of settings.
 _STARS_PER_BIN = 4
 
-# Fewer stars than this do not carry a table.
+# Fewer stars than this, or all of them in fewer bins, do not carry a table.
 MIN_STARS_TABLE = 60
+_MIN_BINS_TABLE = 20
+
+
+def carries_table(residual_map):
+    """Tell whether residuals are enough for a look-up table.
+
+    Parameters
+    ----------
+    residual_map : ResidualMap
+        Residuals of one detector.
+
+    Returns
+    -------
+    bool
+        Whether there are enough stars, and not all of them in a few bins.
+    """
+    if residual_map.n_stars < MIN_STARS_TABLE:
+        return False
+    return int(np.sum(join_bins(residual_map).counts > 0)) >= _MIN_BINS_TABLE
 
 
 def choose_table(residual_map, *, lut="auto"):
@@ -72,10 +92,12 @@ def choose_table(residual_map, *, lut="auto"):
     FitError
         If a table is asked for and the map holds too few stars.
     """
-    n = residual_map.n_stars
-    if n < MIN_STARS_TABLE:
+    if not carries_table(residual_map):
         if lut == "always":
-            raise FitError(f"{n} stars cannot carry a look-up table, {MIN_STARS_TABLE} are needed")
+            raise FitError(
+                f"{residual_map.n_stars} stars in {np.sum(residual_map.counts > 0)} bins cannot "
+                f"carry a look-up table, {MIN_STARS_TABLE} all over the detector are needed"
+            )
         return TableChoice("none"), ()
     return _choose(join_bins(residual_map), allow_none=lut == "auto")
 
@@ -165,7 +187,7 @@ def first_choices(residual_maps):
     """
     found, spectrum = [], None
     for residual_map in residual_maps:
-        if residual_map.n_stars < MIN_STARS_TABLE:
+        if not carries_table(residual_map):
             found.append(TableChoice("none"))
             continue
         bins = Bins(join_bins(residual_map))

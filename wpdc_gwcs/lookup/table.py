@@ -14,7 +14,7 @@ from wpdc_gwcs.lookup._smoother import (
     polynomials,
     saddle,
 )
-from wpdc_gwcs.lookup.choice import MIN_STARS_TABLE, choose_table, first_choice, join_bins
+from wpdc_gwcs.lookup.choice import carries_table, choose_table, first_choice, join_bins
 from wpdc_gwcs.lookup.residual_map import N_FOLDS, ResidualMap
 from wpdc_gwcs.models import LookupTable
 
@@ -106,7 +106,7 @@ def build_lookup_table(
         choice = TableChoice("none")
     elif choice is None and not draft:
         choice, candidates = choose_table(residual_map, lut=lut)
-    elif residual_map.n_stars < MIN_STARS_TABLE:
+    elif not carries_table(residual_map):
         choice = TableChoice("none")
     coarse = join_bins(residual_map)
     if choice is None:

@@ -1,3 +1,5 @@
+"""The solution of exposures whose distortion and pointings are known."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +9,9 @@ from numpy.testing import assert_allclose
 
 from wpdc_gwcs import RadialWeight, build_wcs
 from wpdc_gwcs.exceptions import FitError
-from wpdc_gwcs.instrument import Exposure, solve_instrument
 from wpdc_gwcs.models import deproject, project
 from wpdc_gwcs.solution import Calibration
+from wpdc_gwcs.solve import Exposure, solve
 
 SHAPE = (2000, 2048)
 CRPIX = np.array([1023.5, 999.5])
@@ -69,6 +71,7 @@ class Field:
                     true_cd @ [[1.002, 0.003], [-0.003, 1.002]],
                     error,
                     error,
+                    detector="det-1",
                 )
             )
 
@@ -79,7 +82,7 @@ class Field:
     def errors(self, result, k, n=41):
         """Error of exposure k on a grid over the detector, (2, n, n) px along the true axes."""
         x, y = np.meshgrid(np.linspace(0, SHAPE[1] - 1, n), np.linspace(0, SHAPE[0] - 1, n))
-        sky = wcs_of(result, k)(x, y)
+        sky = frame_of(result, k).wcs(x, y)
         dx, dy = self.distortion(x, y)
         place = np.tensordot(
             np.linalg.inv(self.cds[k]), np.array(project(*sky, self.crvals[k])), axes=1
@@ -94,9 +97,24 @@ class Field:
 
     def solve(self, **options):
         weight = None if options.get("lut") == "none" else WEIGHT
-        return solve_instrument(
+        return solve(
             self.exposures, image_shape=SHAPE, crpix=CRPIX, **{"weight": weight, **options}
         )
+
+
+def turbulence(rng, amplitude, scale, waves=400):
+    """Curl-free displacement with the spectrum of von Karman, px: a sum of plane waves."""
+    # The cumulative distribution of k is 1 - (1 + (k / k0)^2)^(-5/6).
+    k = 2 * np.pi / scale * np.sqrt(rng.uniform(size=waves) ** (-6 / 5) - 1)
+    angle, phase = rng.uniform(0, 2 * np.pi, (2, waves))
+    unit = np.array([np.cos(angle), np.sin(angle)])
+
+    def displacement(x, y):
+        x, y = np.asarray(x)[..., None], np.asarray(y)[..., None]
+        wave = np.cos(k * (unit[0] * x + unit[1] * y) + phase) * 2 * amplitude / np.sqrt(waves)
+        return np.array([wave @ unit[0], wave @ unit[1]])
+
+    return displacement
 
 
 def corner(rng, stars, size):
@@ -107,25 +125,32 @@ def corner(rng, stars, size):
     error = np.full(stars, NOISE)
     x, y = x + rng.normal(size=stars) * error, y + rng.normal(size=stars) * error
     old = field.exposures[0]
-    field.exposures = [Exposure("e0", x, y, ra, dec, old.crval, old.cd, error, error)]
+    field.exposures = [
+        Exposure("e0", x, y, ra, dec, old.crval, old.cd, error, error, detector="det-1")
+    ]
     return field
 
 
-def wcs_of(result, k):
-    fit, s = result.exposures[k], result.solution
-    return build_wcs(
-        crpix=s.crpix, cd=fit.cd, crval=fit.crval, pv=fit.pv or s.pv, pv_cd=s.cd,
-        lookup_table=s.lookup_table, image_shape=s.image_shape,
-    )  # fmt: skip
+def frame_of(result, k):
+    """Calibration of exposure k as `calibrate` delivers it."""
+    fit, solution = result.exposures[k], result.solution
+    return Calibration(
+        fit.name,
+        solution if fit.pv is None else replace(solution, pv=fit.pv),
+        fit.crval,
+        fit.cd,
+        field=fit.field,
+        sigma=fit.sigma,
+    )
 
 
 @pytest.fixture(scope="module")
 def solved():
     field = Field(np.random.default_rng(3), n=6)
-    return field, field.solve(detector="det-1")
+    return field, field.solve()
 
 
-class TestInstrument:
+class TestSolve:
     @pytest.mark.parametrize("n", [1, 4])
     def test_noise_free_cubic_is_recovered(self, rng, n):
         field = Field(rng, n=n, distortion=cubic, noise=0)
@@ -166,8 +191,8 @@ class TestInstrument:
     def test_uncertainty_is_honest(self, solved):
         field, result = solved
         pulls = []
-        for k, fit in enumerate(result.exposures):
-            frame = Calibration(fit.name, result.solution, fit.crval, fit.cd, fit.covariance)
+        for k in range(len(result.exposures)):
+            frame = frame_of(result, k)
             x, y = np.meshgrid(np.linspace(0, SHAPE[1] - 1, 41), np.linspace(0, SHAPE[0] - 1, 41))
             sigma_x, sigma_y, _ = frame.uncertainty(x, y)
             pulls += [field.errors(result, k)[0] / sigma_x, field.errors(result, k)[1] / sigma_y]
@@ -178,11 +203,11 @@ class TestInstrument:
         field = Field(rng, n=5)
         use = rng.uniform(size=400) > 0.2
         field.exposures = [replace(e, use=use) for e in field.exposures]
-        choice = solved[1].table_info.choice
+        choice = {"det-1": solved[1].table_info.choice}
         result = field.solve(table_choice=choice)
         pulls = []
-        for pairs, fit in zip(field.exposures, result.exposures):
-            frame = Calibration(fit.name, result.solution, fit.crval, fit.cd, fit.covariance)
+        for k, (pairs, fit) in enumerate(zip(field.exposures, result.exposures)):
+            frame = frame_of(result, k)
             sigma = frame.uncertainty(pairs.x, pairs.y)[:2]
             assert not np.any(fit.used[~use])
             pulls += [
@@ -229,12 +254,36 @@ class TestInstrument:
         result = field.solve(lut="none", degree=4)
         assert result.solution.pv.degree == 4
         assert field.rms(result) < 1e-4
-        uniform = solve_instrument(
+        uniform = solve(
             field.exposures, image_shape=SHAPE, lut="none", weight=RadialWeight("uniform")
         )
         assert uniform.solution.settings["weight"] == "uniform"
         assert uniform.solution.pv.degree == 3
         assert_allclose(uniform.solution.crpix, [1023.5, 999.5])
+
+    @pytest.mark.parametrize("refine", ["auto", "attitude"])
+    def test_polynomial_alone(self, rng, refine):
+        """Without a table there is no fine structure, and the residuals are those of the WCS."""
+        field = Field(rng, n=2)
+        result = field.solve(lut="none", refine=refine)
+        assert result.solution.lookup_table is None
+        for k, (pairs, fit) in enumerate(zip(field.exposures, result.exposures)):
+            assert fit.field is None
+            x, y = frame_of(result, k).undistort(pairs.x, pairs.y)
+            plane = np.linalg.solve(fit.cd, np.array(project(pairs.ra, pairs.dec, fit.crval)))
+            assert_allclose([fit.dx, fit.dy], [x, y] - CRPIX[:, None] - plane, atol=1e-3)
+        # A cubic leaves 0.5 px at the corners.
+        assert field.rms(result) > 0.03
+
+    def test_residuals_are_those_of_the_wcs(self, solved):
+        field, result = solved
+        for k, (pairs, fit) in enumerate(zip(field.exposures, result.exposures)):
+            x, y = frame_of(result, k).undistort(pairs.x, pairs.y)
+            inside = np.isfinite(x)
+            assert inside.sum() > 390
+            plane = np.linalg.solve(fit.cd, np.array(project(pairs.ra, pairs.dec, fit.crval)))
+            expected = [x, y] - CRPIX[:, None] - plane
+            assert_allclose(np.array([fit.dx, fit.dy])[:, inside], expected[:, inside], atol=1e-3)
 
 
 class TestAttitudes:
@@ -252,7 +301,7 @@ class TestAttitudes:
         assert field.rms(pooled) < 1.02 * field.rms(free)
         assert_allclose(pooled.solution.statistics["attitude_variation"]["scale"], 1e-3, rtol=0.8)
 
-    @pytest.mark.parametrize("stars", [20, 100])
+    @pytest.mark.parametrize("stars", [9, 20, 100])
     def test_new_exposure_of_a_stored_solution(self, solved, rng, stars):
         _, stored = solved
         field = Field(rng, n=2, stars=stars)
@@ -264,17 +313,19 @@ class TestAttitudes:
     def test_stored_solution_of_another_detector(self, solved, rng):
         field = Field(rng, n=1)
         with pytest.raises(FitError, match=r"\(2000, 2048\) px.*\(1000, 1000\)"):
-            solve_instrument(field.exposures, image_shape=(1000, 1000), solution=solved[1].solution)
-
-    def test_too_few_stars_for_an_attitude(self, solved, rng):
-        field = Field(rng, n=1, stars=9)
-        with pytest.raises(FitError, match="exposure e0: 9 of 9 stars"):
-            field.solve(solution=solved[1].solution)
+            solve(field.exposures, image_shape=(1000, 1000), solution=solved[1].solution)
 
     def test_attitude_from_a_corner(self, solved, rng):
+        """Forty stars within 60 px tell nothing of the far corner, and the result says so."""
         field = corner(rng, 40, 60.0)
-        with pytest.raises(FitError, match="far corner of the detector uncertain by"):
-            field.solve(solution=solved[1].solution)
+        result = field.solve(solution=solved[1].solution)
+        sigma_x, sigma_y, _ = frame_of(result, 0).uncertainty(2000.0, 1950.0)
+        error = np.abs(field.errors(result, 0)[:, -1, -1])
+        assert min(sigma_x, sigma_y) > 0.3
+        assert np.all(error < 3.5 * np.array([sigma_x, sigma_y]))
+        # Among them it is that of the table in the corner, and of the shift.
+        near = frame_of(result, 0).uncertainty(30.0, 30.0)[:2]
+        assert max(near) < NOISE
 
 
 class TestUpdate:
@@ -304,37 +355,66 @@ class TestUpdate:
 class TestRefine:
     def test_own_polynomials(self, solved, rng):
         field = Field(rng, n=3, stars=600)
-        choice = solved[1].table_info.choice
+        choice = {"det-1": solved[1].table_info.choice}
         result = field.solve(refine="pv", table_choice=choice)
         assert all(f.pv is not None for f in result.exposures)
         assert_allclose([f.pv.pv1_1.value for f in result.exposures], 1.0)
-        assert result.exposures[0].pv_covariance.shape == (2, 10, 10)
+        assert all(f.field is None for f in result.exposures)
+        assert all(np.isfinite(f.sigma).all() for f in result.exposures)
         # The star noise of one exposure, extrapolated from r0 to the corners.
         shared = field.solve(table_choice=choice)
         assert field.rms(shared) < field.rms(result) < 0.15
 
     def test_auto_keeps_what_predicts(self, solved, rng):
-        choice = solved[1].table_info.choice
-        result = Field(rng, n=3, stars=300).solve(refine="auto", table_choice=choice)
-        assert result.exposures[0].pv is None
+        """Where exposures differ by six numbers, they get no field."""
+        choice = {"det-1": solved[1].table_info.choice}
+        result = Field(rng, n=3, stars=300).solve(table_choice=choice)
+        for fit in result.exposures:
+            assert fit.pv is None
+            assert "field" not in fit.statistics
 
     def test_auto_follows_an_unstable_instrument(self, rng):
+        """Two states of an instrument, 4 px apart at the corners: the fields take what differs."""
         field = Field(rng, n=4, stars=600, distortion=cubic)
         other = Field(rng, n=4, stars=600, distortion=lambda x, y: [1.3 * d for d in cubic(x, y)])
         mixed = [
             *field.exposures[:2],
             *(replace(e, name="o" + e.name) for e in other.exposures[:2]),
         ]
-        result = solve_instrument(
-            mixed,
-            image_shape=SHAPE,
-            crpix=CRPIX,
-            weight=RadialWeight("uniform"),
-            lut="none",
-            refine="auto",
-        )
-        assert all(f.pv is not None for f in result.exposures)
+        result = solve(mixed, image_shape=SHAPE, crpix=CRPIX, weight=RadialWeight("uniform"))
+        assert result.rejected == {}
+        assert all(f.field is not None for f in result.exposures)
         assert max(f.statistics["scatter_dx"] for f in result.exposures) < 1.3 * NOISE
+
+    def test_turbulence(self, rng):
+        """Fields with the spectrum of von Karman, drawn as random plane waves."""
+        field = Field(rng, n=3, stars=900)
+        atmosphere = [turbulence(rng, 0.1, 2500.0) for _ in range(3)]
+        # Where the atmosphere moves a star by +d, its pixel is at +d.
+        field.exposures = [
+            replace(e, x=e.x + dx, y=e.y + dy)
+            for e, (dx, dy) in zip(
+                field.exposures, (a(e.x, e.y) for a, e in zip(atmosphere, field.exposures))
+            )
+        ]
+        plain, auto = field.solve(refine="attitude"), field.solve()
+        assert all(f.field is None for f in plain.exposures)
+        assert all(f.field is not None for f in auto.exposures)
+        x, y = np.meshgrid(np.linspace(0, SHAPE[1] - 1, 41), np.linspace(0, SHAPE[0] - 1, 41))
+
+        def errors(result):
+            # The sky at a pixel is that of the star that was moved there.
+            return np.array([field.errors(result, k) + atmosphere[k](x, y) for k in range(3)])
+
+        sigma = np.array([frame_of(auto, k).uncertainty(x, y)[:2] for k in range(3)])
+        assert np.std(errors(auto)) < 0.6 * np.std(errors(plain))
+        assert 0.6 < np.sqrt(np.mean((errors(auto) / sigma) ** 2)) < 1.4
+
+    def test_field_on_demand(self, rng):
+        result = Field(rng, n=2, stars=200, distortion=cubic).solve(lut="none", refine="field")
+        for fit in result.exposures:
+            assert fit.field is not None
+            assert fit.statistics["field"]["amplitude"] < NOISE
 
 
 class TestRobustness:
@@ -343,7 +423,7 @@ class TestRobustness:
         for e in field.exposures:
             e.x[:8] += rng.normal(0, 8, 8)
             e.y[:8] += rng.normal(0, 8, 8)
-        result = field.solve(table_choice=solved[1].table_info.choice)
+        result = field.solve(table_choice={"det-1": solved[1].table_info.choice})
         assert field.rms(result) < 0.012
         assert np.mean([f.used[:8].mean() for f in result.exposures]) < 0.15
 
@@ -467,43 +547,58 @@ class TestRobustness:
             field.solve()
 
     @pytest.mark.parametrize("lut", ["auto", "none"])
-    def test_few_stars_lower_the_degree(self, rng, lut):
-        field = Field(rng, n=1, stars=25, distortion=lambda x, y: (1e-6 * (x - 1000) ** 2, 0 * y))
+    @pytest.mark.parametrize("stars", [5, 9, 25])
+    def test_few_stars(self, rng, lut, stars):
+        """What they do not tell, the priors do not invent, and the uncertainty knows."""
+        field = Field(
+            rng, n=1, stars=stars, distortion=lambda x, y: (1e-6 * (x - 1000) ** 2, 0 * y)
+        )
         result = field.solve(lut=lut)
-        assert result.solution.pv.degree < 3
-        assert result.solution.lookup_table is None
+        frame = frame_of(result, 0)
+        x, y = np.meshgrid(np.linspace(0, SHAPE[1] - 1, 41), np.linspace(0, SHAPE[0] - 1, 41))
+        sigma = np.array(frame.uncertainty(x, y)[:2])
+        error = field.errors(result, 0)
+        assert np.mean(np.abs(error) < 3 * sigma) > 0.9
+        # The whole distortion is 1 px: 25 stars see a third of it at least.
+        assert field.rms(result) < (0.3 if stars == 25 else 10.0)
 
-    @pytest.mark.parametrize("stars", [0, 5, 9])
-    def test_too_few_stars(self, rng, stars):
-        with pytest.raises(FitError, match=f"{stars} pairs|0 pairs"):
-            Field(rng, n=1, stars=stars).solve()
+    def test_no_stars(self, rng):
+        with pytest.raises(FitError, match="none of 0 pairs can be used"):
+            Field(rng, n=1, stars=0).solve()
 
     def test_all_stars_in_a_corner(self, rng):
+        """It is delivered, and is uncertain by as much as it is wrong elsewhere."""
         field = corner(rng, 400, 300.0)
-        with pytest.raises(
-            FitError, match=r"400 stars span 2\.\d% of the detector \(x \d+ to \d+ of 2048"
-        ):
-            field.solve()
+        result = field.solve()
+        x, y = np.meshgrid(np.linspace(0, SHAPE[1] - 1, 41), np.linspace(0, SHAPE[0] - 1, 41))
+        sigma = np.array(frame_of(result, 0).uncertainty(x, y)[:2])
+        assert np.mean(np.abs(field.errors(result, 0)) < 3 * sigma) > 0.9
+        assert sigma.max() > 1.0
+        assert frame_of(result, 0).uncertainty(150.0, 150.0)[0] < 0.03
 
     def test_no_stars_within_r0(self, rng):
-        field = Field(rng, n=1, stars=400)
+        """The polynomial is that of the map, not of the stars of full weight."""
+        field = Field(rng, n=1, stars=800)
         far = np.hypot(field.exposures[0].x - CRPIX[0], field.exposures[0].y - CRPIX[1]) > 800
         field.exposures = [replace(field.exposures[0], use=far)]
-        with pytest.raises(
-            FitError, match=r"only 0 of \d+ stars have a weight above 0.5 .*r0 = 500 px"
-        ):
-            solve_instrument(
-                field.exposures, image_shape=SHAPE, crpix=CRPIX, weight=RadialWeight(r0=500.0)
-            )
+        result = solve(
+            field.exposures, image_shape=SHAPE, crpix=CRPIX, weight=RadialWeight(r0=500.0)
+        )
+        x, y = np.meshgrid(np.linspace(0, SHAPE[1] - 1, 41), np.linspace(0, SHAPE[0] - 1, 41))
+        sigma = np.array(frame_of(result, 0).uncertainty(x, y)[:2])
+        assert np.mean(np.abs(field.errors(result, 0)) < 3 * sigma) > 0.95
+        assert field.rms(result) < 0.06
 
     def test_bad_options(self, rng):
         field = Field(rng, n=1, stars=50)
-        with pytest.raises(ValueError, match="refine must be"):
+        with pytest.raises(ValueError, match="refine must be one of auto, attitude, field, pv"):
             field.solve(refine="all")
+        with pytest.raises(ValueError, match="degree must be 'auto' or an integer .*, got 8"):
+            field.solve(degree=8)
         with pytest.raises(ValueError, match="lut must be"):
             field.solve(lut="maybe")
         with pytest.raises(FitError, match="no exposure"):
-            solve_instrument([], image_shape=SHAPE)
+            solve([], image_shape=SHAPE)
         field.exposures = [replace(field.exposures[0], ra=np.zeros(3))]
         with pytest.raises(ValueError, match="exposure e0: ra has 3 values, x has 50"):
             field.solve()
@@ -529,25 +624,25 @@ def test_wircam_sensor(shared_data, sensor, table, cubic_only):
         linear = np.linalg.lstsq(columns[kept], plane[kept], rcond=None)[0]
         residual = np.hypot(*(plane - columns @ linear).T)
         kept = residual < 5 * np.median(residual)
-    use = np.random.default_rng(0).uniform(size=len(x)) > 0.2
-    exposure = Exposure(sensor, x, y, ra, dec, deproject(*linear[0], centre), linear[1:].T, use=use)
+    start = deproject(*linear[0], centre), linear[1:].T
 
-    def scatter(lut):
-        fit = solve_instrument([exposure], image_shape=(2048, 2048), lut=lut).exposures[0]
+    def scatter(lut, split):
+        use = np.random.default_rng(split).uniform(size=len(x)) > 0.2
+        exposure = Exposure(sensor, x, y, ra, dec, *start, use=use)
+        fit = solve([exposure], image_shape=(2048, 2048), lut=lut).exposures[0]
         scale = 3.6e6 * np.sqrt(abs(np.linalg.det(fit.cd)))
         held = [d[~use] * scale for d in (fit.dx, fit.dy)]
         return [1.4826 * np.median(np.abs(h - np.median(h))) for h in held]
 
-    assert max(scatter("none")) <= cubic_only
-    assert np.mean(scatter("auto")) <= table
+    # The scatter of one split is known to 5 %.
+    assert np.mean([scatter("none", split) for split in range(3)], axis=0).max() <= cubic_only
+    assert np.mean([scatter("auto", split) for split in range(3)]) <= table
 
 
-def test_draft_and_given_choice(solved):
-    """Quick tables for matching again, then the settings found before."""
+def test_given_choice(solved):
+    """The settings found before make the same table, without trying others."""
     field, result = solved
-    draft = field.solve(draft=True)
-    assert draft.solution.table_sigma is None
-    assert field.rms(draft) < 0.015
-    again = field.solve(table_choice=result.table_info.choice)
+    again = field.solve(table_choice={"det-1": result.table_info.choice})
+    assert result.table_info.candidates
     assert again.table_info.candidates == ()
     assert_allclose(field.rms(again), field.rms(result), rtol=0.05)

@@ -1,0 +1,42 @@
+"""Learnt variances against a direct maximization."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.optimize import minimize
+
+from wpdc_gwcs.solve.evidence import learn_sequence
+
+DECAY, SCATTER = 2.5, 1.2
+
+
+@pytest.mark.parametrize("groups", [1, 2, 6])
+def test_is_the_maximum_of_the_posterior(rng, groups):
+    count = rng.integers(3, 15, groups)
+    square = count * 10.0 ** rng.uniform(-4, 2, groups)
+
+    def cost(log):
+        walk = (np.diff(log) + np.log(DECAY)) / SCATTER
+        return np.sum(count * log + 0.5 * square * np.exp(-2 * log)) + 0.5 * np.sum(walk**2)
+
+    start = 0.5 * np.log(square / count)
+    expected = minimize(cost, start, method="BFGS", options={"gtol": 1e-9}).x
+    found = learn_sequence(square, count, np.ones(groups), DECAY)
+    assert_allclose(np.log(found), expected, atol=1e-4)
+    # Wherever the iteration begins.
+    assert_allclose(learn_sequence(square, count, np.full(groups, 1e-3), DECAY), found, rtol=1e-5)
+
+
+def test_many_coefficients_speak_for_themselves():
+    sigma = np.array([3.0, 0.01, 0.5])
+    count = np.array([100_000] * 3)
+    assert_allclose(learn_sequence(count * sigma**2, count, np.ones(3), DECAY), sigma, rtol=1e-3)
+
+
+def test_what_no_star_tells_follows_the_degree_before():
+    """Its posterior is its prior: the steps lead to a decay, and not to zero."""
+    count = np.array([1000, 4, 5])
+    sigma = np.array([2.0, 2.0, 2.0])
+    for _ in range(500):
+        sigma = learn_sequence(count * sigma**2 * [0, 1, 1] + [4000, 0, 0], count, sigma, DECAY)
+    assert_allclose(sigma, [2.0, 2.0 / DECAY, 2.0 / DECAY**2], rtol=0.02)

@@ -1,0 +1,420 @@
+"""All frames of one camera, solved together: its detectors, and what is each exposure's own."""
+
+import time
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+
+import numpy as np
+from astropy.table import QTable
+
+from wpdc_gwcs.calibration.checks import check_solution, shortcomings
+from wpdc_gwcs.calibration.matched import optional_column
+from wpdc_gwcs.calibration.start import (
+    LinearWCS,
+    detector_center,
+    header_reference_point,
+)
+from wpdc_gwcs.evaluation import evaluate
+from wpdc_gwcs.exceptions import FitError
+from wpdc_gwcs.fitting import MIN_STARS_ATTITUDE, fit_attitude
+from wpdc_gwcs.matching import pair_nearest
+from wpdc_gwcs.models import deproject
+from wpdc_gwcs.solution import Calibration
+from wpdc_gwcs.solve import Exposure, solve
+
+__all__ = ["cameras_of", "solve_camera"]
+
+# The solution is repeated with fresh pairs if more than this share of them changes.
+_MAX_REMATCH = 3
+_SETTLED = 0.01
+_REMATCH_SIGMAS = 5.0
+
+
+def cameras_of(frames):
+    """Group frames that are solved together: detectors that share an exposure are one camera.
+
+    Parameters
+    ----------
+    frames : list of MatchedFrame
+        All matched frames of a run.
+
+    Returns
+    -------
+    list of list of MatchedFrame
+        Connected through detectors and exposures.
+    """
+    parent = {}
+
+    def root(key):
+        parent.setdefault(key, key)
+        while parent[key] != key:
+            parent[key] = parent[parent[key]]
+            key = parent[key]
+        return key
+
+    for frame in frames:
+        parent[root(("exposure", _exposure_key(frame)))] = root(_detector_key(frame))
+    groups = {}
+    for frame in frames:
+        groups.setdefault(root(_detector_key(frame)), []).append(frame)
+    return list(groups.values())
+
+
+def _exposure_key(frame):
+    if frame.camera is None or frame.exposure is None:
+        return frame.name
+    return (frame.camera, frame.exposure)
+
+
+def _detector_key(frame):
+    return ("detector", frame.camera, frame.detector)
+
+
+def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
+    """Solve the frames of one camera together.
+
+    Parameters
+    ----------
+    group : list of MatchedFrame
+        Matched frames of detectors that share exposures, or of one detector.
+    settings : Settings
+        Choices.
+    holdout : (n_catalog,) array_like of bool, optional
+        Reference stars, by their row in the catalogue, that are kept out of every fit.
+    solution : dict, optional
+        Stored solutions by detector.
+    update : bool, optional
+        Merge the frames into the stored solutions.
+
+    Returns
+    -------
+    solutions : dict
+        Detector name to its `DistortionSolution`.
+    calibrations : list of Calibration
+        One for each solved frame.
+    failures : dict
+        Frame name to error.
+    """
+    solution = solution or {}
+    failures = {}
+    group = _of_one_shape(group, failures)
+    began = time.perf_counter()
+    shapes = {frame.detector: tuple(frame.image_shape) for frame in group}
+    crpix = {}
+    for frame in group:
+        if frame.detector in solution:
+            crpix[frame.detector] = np.asarray(solution[frame.detector].crpix, float)
+        elif frame.detector not in crpix:
+            crpix[frame.detector] = _instrument_crpix(frame, settings)
+    least = _least_pairs(group, solution)
+    attitudes = {}
+    for frame in group:
+        try:
+            attitudes[frame.name] = _attitude_of_pairs(frame, crpix[frame.detector], least)
+        except FitError as err:
+            failures[frame.name] = err
+    group = [frame for frame in group if frame.name not in failures]
+    if not group:
+        return {}, [], failures
+    pairs = [frame.pairs for frame in group]
+    choice = None
+    for attempt in range(_MAX_REMATCH):
+        try:
+            result = solve(
+                [_exposure(f, p, attitudes[f.name], holdout) for f, p in zip(group, pairs)],
+                image_shape=shapes,
+                crpix=crpix,
+                weight={name: settings.radial_weight(shape) for name, shape in shapes.items()},
+                degree=settings.degree,
+                n_grid=settings.n_grid,
+                lut=settings.lut,
+                refine=settings.refine,
+                solution=solution or None,
+                update=update,
+                table_choice=choice,
+                seed=settings.seed,
+            )
+        except FitError as err:
+            return {}, [], failures | _own_reasons(group, err)
+        if len(result.table_infos) == len(shapes):
+            # A few other pairs would choose no differently.
+            choice = {name: info.choice for name, info in result.table_infos.items()}
+        if attempt + 1 == _MAX_REMATCH:
+            break
+        found = [
+            None if fit.reason is not None else _as_calibration(frame, fit, result)
+            for frame, fit in zip(group, result.exposures, strict=True)
+        ]
+        fresh = [
+            frame.pairs if calibration is None else _rematch(frame, old, calibration, fit)
+            for frame, old, calibration, fit in zip(group, pairs, found, result.exposures)
+        ]
+        moved = sum(
+            _n_changed(old, new, fit.used)
+            for old, new, fit in zip(pairs, fresh, result.exposures, strict=True)
+        )
+        if moved <= _SETTLED * sum(len(i_src) for i_src, _ in pairs):
+            break
+        pairs = fresh
+        for frame, fit in zip(group, result.exposures, strict=True):
+            if fit.reason is None:
+                attitudes[frame.name] = LinearWCS(
+                    crpix=crpix[frame.detector], cd=fit.cd, crval=fit.crval
+                )
+    seconds = (time.perf_counter() - began) / len(group)
+    solutions = {
+        name: replace(
+            one,
+            provenance={
+                **one.provenance, **_provenance([f for f in group if f.detector == name])
+            },
+        )
+        for name, one in result.solutions.items()
+    }  # fmt: skip
+    result = replace(result, solutions=solutions)
+    calibrations = []
+    for frame, found, fit in zip(group, pairs, result.exposures, strict=True):
+        try:
+            calibrations.append(
+                _calibration(
+                    frame, found, fit, result, settings, holdout, seconds,
+                    stored=None if update else solution.get(frame.detector),
+                )
+            )  # fmt: skip
+        except FitError as err:
+            failures[frame.name] = err
+    _add_scatter(result.solutions, calibrations, [] if update else solution)
+    solved = {c.solution.detector for c in calibrations}
+    return {n: s for n, s in result.solutions.items() if n in solved}, calibrations, failures
+
+
+def _of_one_shape(group, failures):
+    """Frames of the detectors whose frames have one shape; the others fail."""
+    shapes = {}
+    for frame in group:
+        shapes.setdefault(frame.detector, set()).add(tuple(frame.image_shape))
+    for frame in group:
+        if len(shapes[frame.detector]) > 1:
+            failures[frame.name] = FitError(
+                f"detector {frame.detector!r} has frames of different shapes (ny, nx): "
+                + ", ".join(map(str, sorted(shapes[frame.detector])))
+            )
+    return [frame for frame in group if frame.name not in failures]
+
+
+# Pairs that a frame brings at least where its detector is known from elsewhere: they only prove
+# that it is the right place.
+_MIN_PAIRS_KNOWN = 4
+
+
+def _least_pairs(group, solution):
+    """Pairs that each frame needs: fewer where other frames, or a stored solution, know more."""
+    known = bool(solution) or len({f.detector for f in group}) > 1
+    return _MIN_PAIRS_KNOWN if known else MIN_STARS_ATTITUDE
+
+
+def _own_reasons(group, err):
+    """Give each frame of a camera that could not be solved its own error."""
+    reasons = getattr(err, "reasons", {})
+    return {f.name: FitError(f"{f.source}: {reasons.get(f.name, err)}") for f in group}
+
+
+def _add_scatter(solutions, calibrations, stored):
+    for name, solution in solutions.items():
+        scatter = [c.statistics["residuals"] for c in calibrations if c.solution.detector == name]
+        if scatter and name not in stored:
+            solution.statistics["sigma_px"] = float(
+                np.median([max(s["sigma_dx"], s["sigma_dy"]) for s in scatter])
+            )
+
+
+def _as_calibration(frame, fit, result, **more):
+    """Calibration of a frame from the result of the solution."""
+    solution = result.solutions[frame.detector]
+    return Calibration(
+        frame=frame.name,
+        solution=solution if fit.pv is None else replace(solution, pv=fit.pv),
+        crval=np.asarray(fit.crval),
+        cd=np.asarray(fit.cd),
+        field=fit.field,
+        sigma=fit.sigma,
+        color_shift=fit.color_shift,
+        reference_color=result.reference_color,
+        **more,
+    )
+
+
+def _instrument_crpix(frame, settings):
+    """Choose the reference point of the instrument, px, zero based."""
+    center = detector_center(frame.image_shape)
+    if settings.reference_point == "header":
+        return header_reference_point(frame)
+    if settings.reference_point == "center":
+        return center
+    x, y = (np.asarray(frame.sources[c], float)[frame.pairs[0]] for c in "xy")
+    nearest = np.argmin(np.hypot(x - center[0], y - center[1]))
+    return np.array([x[nearest], y[nearest]])
+
+
+def _attitude_of_pairs(frame, crpix, least):
+    """Fit a linear WCS to the pairs of a frame: near the truth whatever its header said."""
+    i_src, i_ref = frame.pairs
+    if least <= len(i_src) < MIN_STARS_ATTITUDE:
+        return LinearWCS(crpix=crpix, cd=frame.start.cd, crval=_sky_at(frame.start, crpix))
+    fit = fit_attitude(
+        np.asarray(frame.sources["x"], float)[i_src],
+        np.asarray(frame.sources["y"], float)[i_src],
+        np.asarray(frame.reference["ra"], float)[i_ref],
+        np.asarray(frame.reference["dec"], float)[i_ref],
+        crpix=crpix,
+        crval=frame.start.crval,
+        cd=frame.start.cd,
+        clip=np.inf,  # the distortion is in the residuals
+    )
+    return LinearWCS(crpix=crpix, cd=fit.cd, crval=fit.crval)
+
+
+def _sky_at(wcs, crpix):
+    """Sky position of a reference point in a linear WCS about another one."""
+    return np.array(deproject(*(wcs.cd @ (crpix - wcs.crpix)), wcs.crval))
+
+
+def _exposure(frame, pairs, attitude, holdout):
+    """Gather what the joint solution needs: pairs with the errors of both sides in px."""
+    i_src, i_ref = pairs
+    src, ref = frame.sources[i_src], frame.reference[i_ref]
+    x_err, y_err = _position_errors(src, ref, attitude.cd)
+    use = None if holdout is None else ~holdout[np.asarray(ref["catalog_index"])]
+    return Exposure(
+        name=frame.name,
+        x=np.asarray(src["x"], float),
+        y=np.asarray(src["y"], float),
+        x_err=x_err,
+        y_err=y_err,
+        ra=np.asarray(ref["ra"], float),
+        dec=np.asarray(ref["dec"], float),
+        crval=attitude.crval,
+        cd=attitude.cd,
+        use=use,
+        color=optional_column(ref, "bp_rp"),
+        detector=frame.detector,
+        exposure=_exposure_key(frame),
+    )
+
+
+def _position_errors(src, ref, cd):
+    """Errors of pairs in px, centroid and reference star together; None where there are none."""
+    x_err, y_err = optional_column(src, "x_err"), optional_column(src, "y_err")
+    if x_err is None or y_err is None:
+        return None, None
+    scale = np.sqrt(abs(np.linalg.det(cd))) * 3.6e6  # mas / px
+    errors = [optional_column(ref, name) for name in ("ra_error", "dec_error")]
+    if any(e is None for e in errors):
+        return x_err, y_err
+    # Small beside those of the centroids: the mean of both axes serves at any roll.
+    reference = np.sqrt(np.mean(np.nan_to_num(errors) ** 2, axis=0)) / scale
+    return np.hypot(x_err, reference), np.hypot(y_err, reference)
+
+
+def _rematch(frame, pairs, calibration, fit):
+    """Pairs of all usable sources with the reference stars where the solution puts them."""
+    pick = np.flatnonzero(frame.usable)
+    src = frame.sources[pick]
+    xs, ys = calibration.undistort(np.asarray(src["x"], float), np.asarray(src["y"], float))
+    attitude = LinearWCS(crpix=calibration.solution.crpix, cd=fit.cd, crval=fit.crval)
+    xr, yr = attitude.pixels(frame.reference["ra"], frame.reference["dec"])
+    # The errors of the pairs say how far apart a star and its source can be.
+    sigma = np.sqrt(0.5 * (fit.x_err**2 + fit.y_err**2))
+    typical = np.nanmedian(sigma[fit.used])
+    x_err, y_err = optional_column(src, "x_err"), optional_column(src, "y_err")
+    if x_err is None or y_err is None:
+        each = np.full(len(src), typical)
+    else:
+        each = np.sqrt(0.5 * (x_err**2 + y_err**2))
+        each = np.nan_to_num(each, nan=typical)
+        own = np.nan_to_num(np.nanmedian(each[np.searchsorted(pick, frame.pairs[0])]), nan=typical)
+        each = np.clip(each * typical / own, 0.5 * typical, 10 * typical)
+    i_src, i_ref, _ = pair_nearest(xs, ys, xr, yr, _REMATCH_SIGMAS * each)
+    i_src = pick[i_src]
+    # Pairs that the fit used are right; of stars whose place is badly known they are wider apart.
+    old = fit.used & ~np.isin(pairs[0], i_src) & ~np.isin(pairs[1], i_ref)
+    return np.append(i_src, pairs[0][old]), np.append(i_ref, pairs[1][old])
+
+
+def _n_changed(before, after, used):
+    """Count new pairs and lost ones; what the fit had not used is no loss."""
+    before, after = (np.array(p, np.int64).T for p in (before, after))
+    key = [p[:, 0] << 32 | p[:, 1] for p in (before, after)]
+    return int(np.sum(~np.isin(key[1], key[0])) + np.sum(~np.isin(key[0][used], key[1])))
+
+
+def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, stored):
+    """Make the result of one frame, if its solution passes its own checks."""
+    if fit.reason is not None:
+        raise FitError(f"{frame.source}: {fit.reason}")
+    i_src, i_ref = pairs
+    src, ref = frame.sources[i_src], frame.reference[i_ref]
+    catalog_index = np.asarray(ref["catalog_index"])
+    held = np.zeros(len(src), bool) if holdout is None else holdout[catalog_index]
+    matches = QTable(
+        {
+            "source_index": i_src.astype(np.int64),
+            "catalog_index": catalog_index.astype(np.int64),
+            "x": np.asarray(src["x"], float),
+            "y": np.asarray(src["y"], float),
+            "x_err": fit.x_err,
+            "y_err": fit.y_err,
+            "ra": np.asarray(ref["ra"], float),
+            "dec": np.asarray(ref["dec"], float),
+            "dx": fit.dx,
+            "dy": fit.dy,
+            "used": fit.used,
+            "holdout": held,
+        }
+    )
+    # Not of use here, but to see whether residuals depend on them.
+    for table, name in ((src, "snr"), (ref, "phot_g_mean_mag"), (ref, "bp_rp")):
+        if name in table.colnames:
+            matches[name] = optional_column(table, name)
+    residuals = evaluate(fit.dx[fit.used], fit.dy[fit.used])
+    scale = np.sqrt(abs(np.linalg.det(fit.cd))) * 3.6e6
+    statistics = {
+        "n_sources": len(frame.sources),
+        "n_matched": len(matches),
+        "n_used": int(fit.used.sum()),
+        "pixel_scale_mas": float(scale),
+        "rms_mas": residuals.rms * scale,
+        "residuals": asdict(residuals),
+        "match": frame.diagnostics.to_dict(),
+        "seconds": frame.seconds + seconds,
+        **{k: v for k, v in fit.statistics.items() if k == "field"},
+    }
+    if held.any():
+        statistics["holdout"] = asdict(evaluate(fit.dx[held], fit.dy[held]))
+    calibration = _as_calibration(
+        frame, fit, result,
+        matches=matches,
+        sources=frame.sources if frame.from_image else None,
+        statistics=statistics,
+        settings=asdict(settings),
+        provenance=_provenance([frame]),
+    )  # fmt: skip
+    known = stored is not None or len(result.solutions) > 1
+    check_solution(frame, calibration, stored=stored, known=known)
+    reasons = shortcomings(frame, calibration, held=held, known=known)
+    statistics["status"] = "degraded" if reasons else "solved"
+    statistics["reasons"] = reasons
+    return calibration
+
+
+def _provenance(group):
+    return {
+        "software": {
+            "wpdc_gwcs": version("wpdc_gwcs"),
+            "numpy": version("numpy"),
+            "astropy": version("astropy"),
+        },
+        "inputs": [frame.source for frame in group],
+        "created": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+    }

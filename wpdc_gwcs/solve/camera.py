@@ -1,0 +1,540 @@
+"""The solution of a camera: arguments in, frozen results out."""
+
+import logging
+from dataclasses import asdict, replace
+
+import numpy as np
+
+from wpdc_gwcs.exceptions import FitError
+from wpdc_gwcs.fitting import RadialWeight
+from wpdc_gwcs.lookup import build_lookup_table, choose_table
+from wpdc_gwcs.solve import terms as make
+from wpdc_gwcs.solve.errors import worse_scatter
+from wpdc_gwcs.solve.exposure import SolveResult
+from wpdc_gwcs.solve.fields import with_fields, with_spectra, with_statics
+from wpdc_gwcs.solve.geometry import start_geometry
+from wpdc_gwcs.solve.model import Model
+from wpdc_gwcs.solve.observations import gather
+from wpdc_gwcs.solve.own_polynomial import own_polynomial
+from wpdc_gwcs.solve.represent import (
+    delivered_residual,
+    frame_fit,
+    represent_detector,
+    represent_frame,
+)
+from wpdc_gwcs.solve.state import (
+    State,
+    all_residuals,
+    linear_step,
+    with_clipping,
+    with_error_models,
+)
+from wpdc_gwcs.solve.stored import StoredMap
+from wpdc_gwcs.solve.tables import choose_tables, folds, residual_maps, with_tables
+
+__all__ = ["solve"]
+
+log = logging.getLogger(__name__)
+
+# Largest degrees tried where the user does not say: of one detector, of a detector of a mosaic, and
+# of the optics of a mosaic.
+_DEGREE_ALONE = 7
+_DEGREE_MOSAIC = 5
+_DEGREE_OPTICS = 9
+
+# Degree of the delivered polynomial; what it leaves is in the table.
+_PV_DEGREE = 3
+
+# Steps of the alternation.
+_ROUNDS_ALIGN = 6
+_ROUNDS_FIELD = 2
+
+# Scatter that no distortion model leaves of right pairs, px.
+_MAX_SCATTER = 2.0
+
+# An exposure whose scatter is this many times that of the others has wrong pairs.
+_REJECT_RATIO = 4.0
+
+# Before anything is solved, distortion scatters residuals, but no more than so many times that of
+# the others, and px; frames of fewer pairs than a linear map has terms tell nothing.
+_ALIEN_RATIO, _ALIEN_SCATTER, _LINEAR_TERMS = 10.0, 50.0, 6
+
+# How much larger residuals may be in one part of the detector than elsewhere before they are
+# taken for outliers, once the instrument is known.
+_MAX_LOCAL_SCALE = 10.0
+
+# Steps of the variances' learning in each linear step.
+_LEARN = 12
+
+_REFINE = ("auto", "attitude", "field", "pv")
+_LUT = ("auto", "always", "none")
+
+
+def solve(
+    exposures,
+    *,
+    image_shape,
+    crpix=None,
+    cd=None,
+    weight=None,
+    degree="auto",
+    n_grid=50,
+    lut="auto",
+    refine="auto",
+    solution=None,
+    update=False,
+    pool_attitudes=True,
+    clip=3.5,
+    table_choice=None,
+    seed=0,
+):
+    r"""Solve for the distortion of all detectors of a camera, and for each exposure.
+
+    Parameters
+    ----------
+    exposures : sequence of Exposure
+        Pairs of each exposure of each detector.
+    image_shape : (int, int) or dict
+        Shape ``(ny, nx)`` of the detectors, or of each by its name.
+    crpix : (2,) array_like or dict, optional
+        Reference point, px, zero based; the center of the detector, or that of ``solution``, if not
+        given.
+    cd : (2, 2) array_like, optional
+        Nominal matrix CD0 in which the polynomial of a single detector stands, deg / px; the mean
+        of the solved ones if not given.
+    weight : RadialWeight or dict, optional
+        Radial weight of the delivered polynomial; ``exp-sqrt`` with 0.87 times half the shorter
+        side if not given, and uniform with ``lut="none"``, where no table mends an extrapolation.
+    degree : int or 'auto', optional
+        Degree of the delivered polynomial, and the largest degree of a detector's own distortion.
+        ``auto``: up to 7 by evidence, delivered as a cubic and a table.
+    n_grid : int, optional
+        Nodes of the look-up table along each axis.
+    lut : {'auto', 'always', 'none'}, optional
+        Whether residuals are smoothed into a table; ``auto`` asks the data.  ``none`` delivers the
+        polynomial alone.
+    refine : {'auto', 'attitude', 'field', 'pv'}, optional
+        What an exposure has of its own: six linear numbers (``attitude``), also a smooth field
+        where its evidence is there (``auto``) or in any case (``field``), or a polynomial of its
+        own (``pv``, the paper's way).
+    solution : DistortionSolution or dict, optional
+        Stored instrument, or one for each detector by its name.
+    update : bool, optional
+        Add the residuals of these exposures to those of ``solution`` and make its table anew.
+    pool_attitudes : bool, optional
+        Let five or more exposures tell how much scale, rotation and skew really vary between them,
+        and draw each exposure's towards their mean accordingly.
+    clip : float, optional
+        Pairs with residuals of more than this many robust standard deviations are left out.
+    table_choice : dict, optional
+        Settings of the tables by detector, as found before (``result.table_infos[name].choice``),
+        instead of choosing them again: for pairs of which only a few have changed.
+    seed : int, optional
+        Seed of the division of a single exposure's stars for cross-validation.
+
+    Returns
+    -------
+    SolveResult
+        Solutions, exposures, and those that were rejected.
+
+    Raises
+    ------
+    FitError
+        If the pairs cannot determine what is asked for; the message names the numbers.
+    ValueError
+        If an option has a wrong value.
+
+    Notes
+    -----
+    The residual of a pair is a sum of linear terms (`wpdc_gwcs.solve.terms`), each with a Gaussian
+    prior whose variance is learnt:
+
+    .. math:: r = \Phi(x) w + O(\varphi) o + B(\varphi) a_e + \delta_e(\varphi) + noise
+
+    1. All terms but the fields are solved at once, with the variance of every degree; outliers are
+       judged by what the other stars predict.
+    2. What is left on the detector, pooled over exposures, becomes its table.
+    3. Each exposure gets the field that its evidence speaks for; the shared terms are solved again
+       with the fields marginalized, tables and fields once more.
+    4. The whole is written down as PV polynomial, table, attitude, and a table of the exposure.
+
+    References
+    ----------
+    WPDC-2P, arXiv:2603.09193, section 3; Bernstein et al. (2017), PASP 129, 074503 (gbdes);
+    Fortino et al. (2021), AJ 162, 106 (turbulence as a Gaussian process).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.solve import Exposure, solve
+    >>> from wpdc_gwcs.models import deproject
+    >>> cd, centre, rng = np.array([[-2e-5, 0], [0, 2e-5]]), 1023.5, np.random.default_rng(1)
+    >>> exposures = []
+    >>> for k in range(3):
+    ...     x, y = rng.uniform(0, 2047, (2, 500))
+    ...     u, v = (x - centre) / 1024, (y - centre) / 1024
+    ...     plane = cd @ [x - centre + 3 * u * (u**2 + v**2), y - centre]
+    ...     ra, dec = deproject(*plane, (120.0 + 0.01 * k, 30.0))
+    ...     exposures.append(Exposure(f"e{k}", x, y, ra, dec, crval=(120.0, 30.0), cd=cd))
+    >>> result = solve(exposures, image_shape=(2048, 2048))
+    >>> result.exposures[2].crval
+    array([120.02, 30. ])
+    """
+    exposures = list(exposures)
+    _check_options(exposures, degree, lut, refine, solution, update)
+    names = list(dict.fromkeys(e.detector for e in exposures))
+    stored = _by_name(solution, names)
+    if stored and len(stored) < len(names):
+        options = {
+            "image_shape": image_shape, "crpix": crpix, "cd": cd, "weight": weight,
+            "degree": degree, "n_grid": n_grid, "lut": lut, "refine": refine, "update": update,
+            "pool_attitudes": pool_attitudes, "clip": clip, "table_choice": table_choice,
+            "seed": seed,
+        }  # fmt: skip
+        return _solve_apart(exposures, stored, options)
+    shapes = {n: tuple(int(v) for v in s) for n, s in _by_name(image_shape, names).items()}
+    points = _reference_points(crpix, names, shapes, stored)
+    o = gather(exposures, shapes, points)
+    weights = _weights(weight, names, shapes, lut)
+    pv_degree = _PV_DEGREE if degree == "auto" else int(degree)
+    # Without a table nothing takes what the delivered polynomial cannot.
+    state = _start(o, pv_degree if lut == "none" else degree, stored)
+    state = _align(o, state, clip, pool_attitudes)
+    group = folds(o, seed)
+    infos = [None] * len(o.detectors)
+    choices = None if table_choice is None else [(table_choice[n], ()) for n in names]
+    alone = o.n_exposures == 1
+    mosaic = len(o.detectors) > 1 and not stored
+    if mosaic and lut != "none":
+        state = _settled(o, with_statics(o, state), clip, pool_attitudes)
+        state = with_error_models(o, state)
+    if lut != "none" and not stored and not alone:
+        # Errors are what they are only once a first table has taken the fine structure.
+        state, _ = with_tables(o, state, group, n_grid, lut, draft=True)
+        state = with_error_models(o, _settled(o, state, clip, pool_attitudes))
+        if choices is None:
+            choices = choose_tables(residual_maps(o, state, group), lut)
+        state, infos = with_tables(o, state, group, n_grid, lut, choices=choices, draft=True)
+        state = with_error_models(o, _settled(o, state, clip, pool_attitudes))
+    # Without a table there is nothing to write a field down in, unless it is asked for.
+    if refine == "field" or (refine == "auto" and lut != "none"):
+        for _ in range(_ROUNDS_FIELD):
+            state = with_spectra(o, state, force=refine == "field")
+            if not any(state.spectra.values()):
+                break
+            state = linear_step(o, state, learn=_LEARN, pool=pool_attitudes)
+            state = with_fields(o, state)
+            state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE)
+            # What was scatter before is field now: the errors are smaller than they seemed.
+            state = with_fields(o, with_error_models(o, state))
+            if mosaic and lut != "none":
+                state = with_statics(o, state)
+            if lut != "none" and not stored and not alone:
+                state, infos = with_tables(
+                    o, state, group, n_grid, lut, choices=choices, draft=True
+                )
+    if lut != "none" and not stored:
+        if choices is None:
+            choices = choose_tables(residual_maps(o, state, group), lut)
+        state, infos = with_tables(o, state, group, n_grid, lut, choices=choices)
+        state = _settled(o, state, clip, pool_attitudes)
+    if update:
+        state, stored, infos = _updated(o, state, stored, group, n_grid)
+        state = _settled(o, state, clip, pool_attitudes)
+    state = with_error_models(o, state)
+    state = linear_step(o, state, learn=1, pool=pool_attitudes)
+    if any(state.spectra.values()):
+        state = with_fields(o, state)
+    return _result(o, state, stored, infos, group, {
+        "weight": weights, "degree": degree, "pv_degree": pv_degree, "n_grid": n_grid,
+        "lut": lut, "refine": refine, "clip": float(clip), "pool_attitudes": bool(pool_attitudes),
+    }, cd, update)  # fmt: skip
+
+
+def _solve_apart(exposures, stored, options):
+    """Solve detectors with a stored solution, and those without, as two cameras."""
+    known = [e for e in exposures if e.detector in stored]
+    others = [e for e in exposures if e.detector not in stored]
+    first = solve(known, solution=stored, **options)
+    second = solve(others, **(options | {"update": False}))
+    fits = {f.name: f for f in first.exposures + second.exposures}
+    return SolveResult(
+        first.solutions | second.solutions,
+        tuple(fits[e.name] for e in exposures),
+        first.rejected | second.rejected,
+        first.table_infos | second.table_infos,
+        first.reference_color if second.reference_color is None else second.reference_color,
+    )
+
+
+def _check_options(exposures, degree, lut, refine, solution, update):
+    if refine not in _REFINE:
+        raise ValueError(f"refine must be one of {', '.join(_REFINE)}, got {refine!r}")
+    if lut not in _LUT:
+        raise ValueError(f"lut must be one of {', '.join(_LUT)}, got {lut!r}")
+    if degree != "auto" and not (isinstance(degree, (int, np.integer)) and 1 <= degree <= 7):
+        raise ValueError(f"degree must be 'auto' or an integer from 1 to 7, got {degree!r}")
+    if not exposures:
+        raise FitError("no exposure was given")
+    if update and solution is None:
+        raise ValueError("update needs a stored solution")
+
+
+def _by_name(value, names):
+    """Give each detector its value: by name, or the same for all; nothing for `None`."""
+    if value is None:
+        return {}
+    return (
+        {n: value[n] for n in names if n in value}
+        if isinstance(value, dict)
+        else dict.fromkeys(names, value)
+    )
+
+
+def _reference_points(crpix, names, shapes, stored):
+    points = _by_name(crpix, names)
+    for name in names:
+        if name in stored:
+            shape = tuple(stored[name].image_shape)
+            if shape != shapes[name]:
+                raise FitError(
+                    f"the stored solution is for a detector of {shape} px (ny, nx), these "
+                    f"exposures have {shapes[name]}"
+                )
+            points[name] = stored[name].crpix
+        elif points.get(name) is None:
+            points[name] = 0.5 * (np.array(shapes[name][::-1]) - 1.0)
+    return {n: np.array(p, dtype=float) for n, p in points.items()}
+
+
+def _weights(weight, names, shapes, lut):
+    given = _by_name(weight, names)
+    default = "uniform" if lut == "none" else "exp-sqrt"
+    return {n: given.get(n) or RadialWeight.for_shape(shapes[n], default) for n in names}
+
+
+def _start(o, degree, stored):
+    """State before anything is solved."""
+    mosaic = len(o.detectors) > 1
+    chosen = []
+    if not stored:
+        largest = (_DEGREE_MOSAIC if mosaic else _DEGREE_ALONE) if degree == "auto" else degree
+        if mosaic:
+            chosen += [make.optics(_DEGREE_OPTICS), make.place(), make.tilt()]
+        if largest > 1:
+            chosen.append(make.polynomial(largest, mosaic=mosaic))
+    elif mosaic:
+        chosen.append(make.place())
+    chosen.append(make.attitude())
+    if np.isfinite(o.reference_color) and np.any(o.color):
+        chosen.append(make.refraction())
+        if not stored:
+            chosen.append(make.lateral_color())
+    counts = {"camera": (), "detector": (len(o.detectors),), "exposure": (o.n_exposures,)}
+    model = Model(
+        geometry=start_geometry(o),
+        terms=tuple(chosen),
+        coefficients={t.name: np.zeros((*counts[t.scope], t.size)) for t in chosen},
+        sigma={t.name: t.start.copy() for t in chosen},
+        tables=tuple(StoredMap(stored[d.name]) if d.name in stored else None for d in o.detectors),
+    )
+    return State(model, o.sigma.copy(), o.valid.copy(), (None,) * len(o.frames))
+
+
+def _align(o, state, clip, pool):
+    """Solve all terms, outliers and errors together, from the start of the frames."""
+    state = _without_aliens(o, state)
+    for turn in range(_ROUNDS_ALIGN):
+        state = linear_step(o, state, learn=_LEARN, pool=pool)
+        # Distortion that is not yet in the model is not noise: clip little at first.
+        state = with_clipping(o, state, clip, relax=max(1.0, 4.0 / 2**turn))
+        if turn and not o.has_errors.all():
+            state = with_error_models(o, state)
+    state = _without_wrong(o, state)
+    state = linear_step(o, state, learn=_LEARN, pool=pool)
+    return with_error_models(o, state)
+
+
+def _without_aliens(o, state):
+    """Leave out frames whose pairs no linear map brings near those of the others.
+
+    One of them would draw the polynomial of all towards itself.
+    """
+    residual = all_residuals(o, state)
+    reasons, scatter = list(state.reason), {}
+    for f in state.active:
+        s = o.slices[f]
+        r = residual[:, s][:, o.valid[s]]
+        seen = np.isfinite(r).all(0)
+        if not seen.size:
+            reasons[f] = "none of its pairs can be used"
+        elif not seen.mean() > 0.5:
+            reasons[f] = "its stars are not where it points: wrong pairs"
+        elif seen.sum() > _LINEAR_TERMS:
+            x, y = o.x[s][o.valid[s]][seen], o.y[s][o.valid[s]][seen]
+            rows = np.stack([np.ones_like(x), x, y], axis=1)
+            left = r[:, seen].T - rows @ np.linalg.lstsq(rows, r[:, seen].T, rcond=None)[0]
+            scatter[f] = worse_scatter(left.T)
+    typical = np.median(list(scatter.values())) if scatter else 0.0
+    for f, value in scatter.items():
+        if len(scatter) > 2 and value > max(_ALIEN_RATIO * typical, _ALIEN_SCATTER):
+            reasons[f] = (
+                f"its residuals scatter by {value:.3g} px, those of the others by "
+                f"{typical:.3g} px: wrong pairs"
+            )
+    return _left_out(o, state, reasons)
+
+
+def _without_wrong(o, state):
+    """Leave out frames whose pairs scatter as only wrong ones do."""
+    residual = all_residuals(o, state)
+    scatter = {}
+    for f in state.active:
+        valid = o.valid[o.slices[f]]
+        if valid.any():
+            scatter[f] = worse_scatter(residual[:, o.slices[f]][:, valid])
+    reasons = list(state.reason)
+    typical = np.median(list(scatter.values()))
+    for f in state.active:
+        if f not in scatter:
+            reasons[f] = "none of its pairs can be used"
+        elif scatter[f] > _MAX_SCATTER:
+            reasons[f] = f"its residuals scatter by {scatter[f]:.3g} px: wrong pairs"
+        elif len(scatter) > 2 and scatter[f] > max(_REJECT_RATIO * typical, 0.1):
+            reasons[f] = (
+                f"its residuals scatter by {scatter[f]:.3g} px, those of the others by "
+                f"{typical:.3g} px: wrong pairs"
+            )
+    return _left_out(o, state, reasons)
+
+
+def _left_out(o, state, reasons):
+    kept = state.kept.copy()
+    for f, reason in enumerate(reasons):
+        if reason is not None and state.reason[f] is None:
+            log.warning("exposure %s left out: %s", o.frames[f].name, reason)
+            kept[o.slices[f]] = False
+    if all(reasons):
+        own = {frame.name: r for frame, r in zip(o.frames, reasons)}
+        listed = "; ".join(f"{name}: {r}" for name, r in own.items())
+        raise FitError(
+            f"exposure {listed}"
+            if len(own) == 1
+            else f"all {len(own)} exposures were left out: {listed}",
+            reasons=own,
+        )
+    return replace(state, kept=kept, reason=tuple(reasons))
+
+
+def _settled(o, state, clip, pool):
+    """State with all terms, fields and outliers for the present tables."""
+    for _ in range(2):
+        state = linear_step(o, state, learn=1, pool=pool)
+        state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE)
+    return with_fields(o, state) if any(state.spectra.values()) else state
+
+
+def _updated(o, state, stored, group, n_grid):
+    """Merge the residuals of these exposures into stored solutions, and make tables anew."""
+    for name, solution in stored.items():
+        if solution.residual_map is None:
+            raise FitError(
+                f"the stored solution of {name!r} holds no residual map: it cannot be updated"
+            )
+    maps = residual_maps(o, state, group, [stored[d.name].lookup_table for d in o.detectors])
+    stored, infos, tables = dict(stored), [], []
+    for detector, new in zip(o.detectors, maps):
+        solution = stored[detector.name]
+        merged = solution.residual_map + new
+        choice, candidates = choose_table(merged)
+        table, info = build_lookup_table(merged, n_grid, choice=choice)
+        infos.append(replace(info, candidates=candidates))
+        solution = replace(
+            solution, lookup_table=table, table_sigma=info.sigma, residual_map=merged
+        )
+        stored[detector.name] = solution
+        tables.append(StoredMap(solution))
+    return replace(state, model=replace(state.model, tables=tuple(tables))), stored, infos
+
+
+def _result(o, state, stored, infos, group, settings, cd, update):
+    """Frozen results of a solved state."""
+    n_grid, lut, refine, degree = (settings[k] for k in ("n_grid", "lut", "refine", "degree"))
+    pv_degree = settings["pv_degree"]
+    solutions = {}
+    weights = settings.pop("weight")
+    del settings["pv_degree"]
+    for k, detector in enumerate(o.detectors):
+        if not any(o.detector_of[f] == k for f in state.active):
+            continue
+        if detector.name in stored:
+            solution = stored[detector.name]
+            if not update:
+                solutions[detector.name] = solution
+                continue
+        else:
+            solution = represent_detector(
+                o, state, k, weight=weights[detector.name], degree=pv_degree,
+                n_grid=0 if lut == "none" else n_grid, cd=cd,
+                table_sigma=None if infos[k] is None else infos[k].sigma,
+            )  # fmt: skip
+        weight = weights[detector.name]
+        solutions[detector.name] = replace(
+            solution,
+            statistics={**solution.statistics, **_statistics(o, state, k, infos[k], solution)},
+            settings={**settings, "weight": weight.name, "r0": float(weight.r0)},
+        )
+    residual = all_residuals(o, state)
+    fits = []
+    for f in range(len(o.frames)):
+        parts = {}
+        if state.reason[f] is None:
+            solution = solutions[o.detector(f).name]
+            tabled = lut != "none" or refine == "field"
+            parts = represent_frame(o, state, f, solution, n_grid=n_grid if tabled else 0)
+            if not tabled:
+                residual[:, o.slices[f]] = delivered_residual(o, f, solution, parts)
+            if refine == "pv":
+                parts = own_polynomial(o, state, f, solution, parts, residual, weights)
+        fits.append(frame_fit(o, state, f, residual, parts))
+    if not stored:
+        solutions = _with_maps(o, state, group, solutions)
+    rejected = {fit.name: fit.reason for fit in fits if fit.reason is not None}
+    named = {d.name: i for d, i in zip(o.detectors, infos) if i is not None}
+    color = float(o.reference_color) if np.isfinite(o.reference_color) else None
+    return SolveResult(solutions, tuple(fits), rejected, named, color)
+
+
+def _with_maps(o, state, group, solutions):
+    """Solutions with the binned residuals behind them, about their polynomials alone."""
+    tables = [solutions[d.name].lookup_table if d.name in solutions else None for d in o.detectors]
+    maps = residual_maps(o, state, group, tables)
+    return {
+        d.name: replace(solutions[d.name], residual_map=m)
+        for d, m in zip(o.detectors, maps)
+        if d.name in solutions
+    }
+
+
+def _statistics(o, state, k, info, solution):
+    frames = [f for f in state.active if o.detector_of[f] == k]
+    kept = int(sum(state.kept[o.slices[f]].sum() for f in frames))
+    statistics = {"n_exposures": len(frames), "n_used": kept}
+    for name, value in statistics.items():
+        statistics[name] = value + solution.statistics.get(name, 0)
+    # One model for pairs with stated errors, one for pairs without (there the scale is the error
+    # in px); the first of them by itself, too.
+    first = next(iter(state.error_models.values()))
+    statistics |= {
+        "error_scale": first["scale"], "error_floor": first["floor"],
+        "error_models": state.error_models,
+        "learned": {t.name: [float(v) for v in state.model.sigma[t.name]]
+                    for t in state.model.terms if t.decay or t.chromatic},
+    }  # fmt: skip
+    if state.pooled:
+        statistics["attitude_variation"] = state.pooled
+    if info is not None:
+        statistics["table"] = asdict(info.choice)
+        statistics["table_chi2"] = float(info.chi2)
+        statistics["table_candidates"] = [asdict(c) for c in info.candidates]
+    return statistics

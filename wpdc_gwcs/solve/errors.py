@@ -1,0 +1,200 @@
+"""Errors of pairs: what is clipped, how large they are, how much attitudes vary."""
+
+import numpy as np
+from scipy.optimize import nnls
+
+from wpdc_gwcs.fitting import robust_sigma
+
+__all__ = ["clip_outliers", "error_model", "frame_scale", "linear_scatter", "worse_scatter"]
+
+# Scale, rotation and the two shears of a small linear map (bxx, bxy, byx, byy).
+MODES = np.array([[1, 0, 0, 1], [0, -1, 1, 0], [1, 0, 0, -1], [0, 1, 1, 0]]) / np.sqrt(2)
+MODE_NAMES = ("scale", "rotation", "stretch", "shear")
+
+# Degrees of freedom that the errors of all frames count for in each of them.
+_POOLED_FREEDOM = 200.0
+
+# Degrees of freedom that the stated errors count for: a few stars do not prove them wrong.
+_STATED_FREEDOM = 40.0
+
+
+def worse_scatter(values):
+    """Robust scatter about zero of the worse of two axes.
+
+    Parameters
+    ----------
+    values : sequence of (N,) array_like
+        Residuals of each axis.
+    """
+    return max(robust_sigma(v) for v in values)
+
+
+def clip_outliers(observations, residual, sigma, leverage, clip, *, local=np.inf, relax=1.0):
+    """Decide which pairs are kept.
+
+    Parameters
+    ----------
+    observations : Observations
+        Pairs.
+    residual, sigma : (2, N) ndarray
+        Residuals and their errors, px.
+    leverage : (2, N) ndarray
+        Share of its own variance that the model predicts a star's residual with: of a star that is
+        fitted, the hat matrix; 0 where it is negligible.
+    clip : float
+        Limit in robust standard deviations.
+    local : float, optional
+        How much larger residuals may be in one part of a detector than elsewhere.
+    relax : float, optional
+        Multiplies the limit.
+
+    Returns
+    -------
+    (N,) ndarray of bool
+        Pairs kept.
+
+    Notes
+    -----
+    A pair is compared with those about it on the detector and with those of its frame: where the
+    instrument is not yet known, which may be far from where most stars are, all residuals are
+    large, and clipping them would keep it unknown.  A star that the model follows has a small
+    residual whatever is wrong with it: it is judged by what the others predict.
+    """
+    o = observations
+    normalized = np.abs(residual) / (sigma * np.sqrt(np.clip(1.0 - leverage, 1e-3, None)))
+    usable = o.valid & np.isfinite(normalized).all(0)
+    if not usable.any():
+        return usable
+    overall = worse_scatter(normalized[:, usable])
+    limit = np.full(len(o), overall)
+    for k, detector in enumerate(o.detectors):
+        member = np.zeros(len(o), bool)
+        for f in np.flatnonzero(o.detector_of == k):
+            member[o.slices[f]] = True
+        member &= usable
+        n = int(member.sum())
+        if not n:
+            continue
+        g = int(np.clip(np.sqrt(n / 100), 1, 12))
+        ny, nx = detector.image_shape
+        cell = np.clip((o.x[member] + 0.5) * g / nx, 0, g - 1).astype(int) * g
+        cell += np.clip((o.y[member] + 0.5) * g / ny, 0, g - 1).astype(int)
+        order = np.argsort(cell, kind="stable")
+        scale = np.full(g * g, overall)
+        values = normalized[:, member]
+        for part in np.split(order, np.flatnonzero(np.diff(cell[order])) + 1):
+            scale[cell[part[0]]] = worse_scatter(values[:, part])
+        limit[member] = np.clip(scale[cell], overall, local * overall)
+    for s in o.slices:
+        if usable[s].any():
+            limit[s] = np.maximum(limit[s], worse_scatter(normalized[:, s][:, usable[s]]))
+    limit = relax * clip * np.maximum(limit, 1e-10)
+    return usable & (np.max(np.where(usable, normalized, 0.0), axis=0) <= limit)
+
+
+def error_model(residual, sigma, *, stated, freedom):
+    """Scale s and floor f of the errors: robust variance of the residuals = (s sigma)^2 + f^2.
+
+    Parameters
+    ----------
+    residual, sigma : (2, N) ndarray
+        Residuals, inflated for what the fit took, and their errors.
+    stated : bool
+        Whether the errors were given: then there is a floor, and few stars do not overrule them.
+    freedom : float
+        Degrees of freedom of the residuals.
+
+    Returns
+    -------
+    scale, floor : float
+        Of the errors.
+
+    Notes
+    -----
+    Stars are put into groups of equal error; the variances of the groups are fitted, each with its
+    own uncertainty.
+    """
+    order = np.argsort(sigma.ravel())
+    r, e = residual.ravel()[order], sigma.ravel()[order]
+    groups = max(1, min(12, len(r) // 200)) if stated else 1
+    parts = np.array_split(np.arange(len(r)), groups)
+    # Residuals over errors: a group may hold a wide range of errors.
+    e2 = np.array([np.median(e[i] ** 2) for i in parts])
+    v = np.array([robust_sigma(r[i] / e[i]) ** 2 for i in parts]) * e2
+    if groups > 1 and e2.max() > 1.5 * e2.min():
+        scale2, floor2 = nnls(
+            np.stack([e2, np.ones_like(e2)], axis=1) / v[:, None], np.ones_like(v)
+        )[0]
+    else:
+        scale2, floor2 = np.median(v / e2), 0.0
+    if scale2 <= 0:
+        # Errors that say nothing about the residuals.
+        scale2 = 1e-6
+    if stated:
+        share = freedom / (freedom + _STATED_FREEDOM)
+        scale2, floor2 = share * scale2 + 1.0 - share, share * floor2
+    return float(np.sqrt(scale2)), float(np.sqrt(floor2))
+
+
+def frame_scale(pull, freedom):
+    """Scale of the errors of one frame over those of all: its seeing was better or worse.
+
+    Parameters
+    ----------
+    pull : (2, N) ndarray
+        Residuals over errors.
+    freedom : float
+        Degrees of freedom of the residuals.
+
+    Returns
+    -------
+    float
+        Factor of the errors; near 1 for few stars.
+    """
+    own = np.mean([robust_sigma(p) ** 2 for p in pull])
+    return float(np.sqrt((freedom * own + _POOLED_FREEDOM) / (freedom + _POOLED_FREEDOM)))
+
+
+def linear_scatter(b, covariance):
+    """Variances and means of the modes of the exposures' linear maps.
+
+    Parameters
+    ----------
+    b : (E, 2, 2) ndarray
+        Linear maps of the exposures less unity.
+    covariance : (E, 6, 6) ndarray
+        Of (ax, bxx, bxy, ay, byx, byy).
+
+    Returns
+    -------
+    variance, mean : (4,) ndarray
+        Of scale, rotation, stretch and shear.
+
+    Notes
+    -----
+    Each mode has its own variance between exposures, estimated as the posterior mean under a flat
+    prior of the standard deviation (restricted likelihood), which is never zero: a few exposures do
+    not prove that nothing varies.
+    """
+    n = len(b)
+    modes = b.reshape(n, 4) @ MODES.T
+    linear = np.array([1, 2, 4, 5])
+    error = np.einsum("ki,eij,kj->ek", MODES, covariance[:, linear][:, :, linear], MODES)
+    variance, mean = np.empty(4), np.empty(4)
+    for m in range(4):
+        typical = np.sqrt(np.median(error[:, m]))
+        spread = np.std(modes[:, m])
+        tau = np.linspace(0.0, 5.0 * max(spread, typical), 400)
+        total = error[:, m] + tau[:, None] ** 2
+        w = 1.0 / total
+        center = np.sum(w * modes[:, m], axis=1) / w.sum(1)
+        like = -0.5 * (
+            np.log(total).sum(1)
+            + np.log(w.sum(1))
+            + np.sum(w * (modes[:, m] - center[:, None]) ** 2, axis=1)
+        )
+        like = np.exp(like - like.max())
+        variance[m] = np.sum(like * tau**2) / np.sum(like)
+        w = 1.0 / (error[:, m] + variance[m])
+        mean[m] = np.sum(w * modes[:, m]) / w.sum()
+    return variance, mean

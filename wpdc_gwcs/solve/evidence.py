@@ -1,0 +1,58 @@
+"""Variances of groups of coefficients, learnt from the coefficients and their covariance."""
+
+import numpy as np
+
+__all__ = ["learn_sequence"]
+
+# Scatter of the logarithm of a group's size about what the group before it lets one expect.  Broad:
+# one degree of a distortion may well be ten times another.
+_LOG_SCATTER = 1.2
+
+_NEWTON_STEPS = 30
+
+
+def learn_sequence(square, count, sigma, decay):
+    """Learn the standard deviations of a sequence of groups: one step of expectation maximization.
+
+    Parameters
+    ----------
+    square : (G,) ndarray
+        Expected sum of squares of the coefficients of each group: value^2 + variance.
+    count : (G,) ndarray
+        Number of coefficients of each group.
+    sigma : (G,) ndarray
+        Standard deviations before the step.
+    decay : float
+        Factor by which a group is expected to be smaller than the one before it.
+
+    Returns
+    -------
+    (G,) ndarray
+        Standard deviations after it.
+
+    Notes
+    -----
+    Maximizes ``sum(-n ln s - S / (2 s^2))`` with a Gaussian random walk of ``ln s`` as prior, so
+    that a degree about which the stars say nothing is taken to be somewhat smaller than the one
+    below it, and never to be zero.
+    """
+    walk = np.zeros((len(count), len(count)))
+    offset = np.zeros(len(count))
+    for i in range(1, len(count)):
+        # (l_i - l_{i-1} + ln decay)^2 / (2 scatter^2)
+        walk[i, i] += 1
+        walk[i - 1, i - 1] += 1
+        walk[i, i - 1] -= 1
+        walk[i - 1, i] -= 1
+        offset[i] += np.log(decay)
+        offset[i - 1] -= np.log(decay)
+    walk, offset = walk / _LOG_SCATTER**2, offset / _LOG_SCATTER**2
+    log = np.log(sigma)
+    for _ in range(_NEWTON_STEPS):
+        chi = square * np.exp(-2 * log)
+        gradient = count - chi + walk @ log + offset
+        step = np.linalg.solve(walk + np.diag(2 * chi + 1e-9), gradient)
+        log = log - np.clip(step, -1.0, 1.0)
+        if np.abs(step).max() < 1e-6:
+            break
+    return np.exp(log)

@@ -1,0 +1,140 @@
+"""Exposures as they go into the solution, and as they come out."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from wpdc_gwcs.models import LookupTable, PVPolynomial
+
+__all__ = ["Exposure", "ExposureFit", "SolveResult"]
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Pairs of one exposure of one detector, and where it was thought to point.
+
+    Parameters
+    ----------
+    name : str
+        Name of the frame, for messages.
+    x, y : (N,) array_like
+        Measured positions, px, zero based.
+    ra, dec : (N,) array_like
+        Reference positions at the epoch of the exposure, deg.
+    crval : (2,) array_like
+        Starting RA and Dec of the reference point, deg.
+    cd : (2, 2) array_like
+        Starting linear matrix, deg / px.
+    x_err, y_err : (N,) array_like, optional
+        Total 1-sigma errors (centroid and reference), px; estimated from the residuals if not
+        given.
+    use : (N,) array_like of bool, optional
+        Stars that may be fitted; the others (held out) only get residuals.
+    color : (N,) array_like, optional
+        Colors of the stars, mag; NaN where unknown.
+    detector : str, optional
+        Name of the detector.
+    exposure : hashable, optional
+        What the frames of one exposure of a mosaic have in common; on its own if not given.
+    """
+
+    name: str
+    x: np.ndarray
+    y: np.ndarray
+    ra: np.ndarray
+    dec: np.ndarray
+    crval: np.ndarray
+    cd: np.ndarray
+    x_err: np.ndarray | None = None
+    y_err: np.ndarray | None = None
+    use: np.ndarray | None = None
+    color: np.ndarray | None = None
+    detector: str = ""
+    exposure: object | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureFit:
+    """What the solution found for one exposure of one detector.
+
+    Parameters
+    ----------
+    name : str
+        Name of the frame.
+    crval : (2,) ndarray
+        RA and Dec of the reference point, deg.
+    cd : (2, 2) ndarray
+        Linear matrix, deg / px.
+    dx, dy : (N,) ndarray
+        Residuals X'' - X_ref, Y'' - Y_ref of all pairs given, undistorted px; NaN where a position
+        is NaN.
+    x_err, y_err : (N,) ndarray
+        Errors of the pairs as the fit found them: those given, rescaled, with a floor.
+    used : (N,) ndarray of bool
+        Pairs that were fitted: allowed, valid and not clipped.
+    sigma : (3, n, n) ndarray or None
+        Uncertainty of the map over the detector: sigma_x, sigma_y in px and their correlation on a
+        grid from one outer edge to the other.
+    field : LookupTable or None
+        The exposure's own displacement, to be subtracted with the table of the instrument.
+    pv : PVPolynomial or None
+        The exposure's own polynomial with ``refine="pv"``.
+    color_shift : (2, 3) ndarray or None
+        Displacement of stars per magnitude of color in undistorted px: constant and linear part.
+    reason : str or None
+        Why the exposure was left out; its numbers are then the starting values.
+    statistics : dict
+        Counts and scatter of the pairs used, px.
+    """
+
+    name: str
+    crval: np.ndarray
+    cd: np.ndarray
+    dx: np.ndarray
+    dy: np.ndarray
+    x_err: np.ndarray
+    y_err: np.ndarray
+    used: np.ndarray
+    sigma: np.ndarray | None = None
+    field: "LookupTable | None" = None
+    pv: "PVPolynomial | None" = None
+    color_shift: np.ndarray | None = None
+    reason: str | None = None
+    statistics: dict = dataclasses.field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class SolveResult:
+    """The detectors of a camera and all their exposures.
+
+    Parameters
+    ----------
+    solutions : dict
+        Name of a detector to its `DistortionSolution`.
+    exposures : tuple of ExposureFit
+        One per frame given, in that order.
+    rejected : dict of str
+        Names of the frames that were left out, and why.
+    table_infos : dict
+        Name of a detector to its `TableInfo`; no entry where there was no table to be made.
+    reference_color : float or None
+        Color that the solution is for; `None` where no colors were given.
+    """
+
+    solutions: dict
+    exposures: tuple
+    rejected: dict
+    table_infos: dict = dataclasses.field(default_factory=dict)
+    reference_color: float | None = None
+
+    @property
+    def solution(self):
+        """The solution of the only detector."""
+        (only,) = self.solutions.values()
+        return only
+
+    @property
+    def table_info(self):
+        """How the table of the only detector came about, or None."""
+        return next(iter(self.table_infos.values()), None)

@@ -1,0 +1,202 @@
+"""Fields of all exposures: waves for every detector, spectra by evidence, posteriors."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from wpdc_gwcs.solve.field import Basis, fit_field, learn_spectra, patch, products
+from wpdc_gwcs.solve.model import design, focal_variance, residuals
+
+__all__ = ["with_fields", "with_spectra", "with_statics"]
+
+# Waves that are marginalized while the shared terms are solved, and those of the final field; stars
+# for each.
+_MOST_MARGINAL, _MOST_FINAL = 250, 1000
+_STARS_PER_WAVE_MARGINAL, _STARS_PER_WAVE = 3, 4
+
+# Waves of what the exposures of a detector share.
+_MOST_STATIC = 400
+
+# Frames of an exposure that its spectrum is learnt from, those with the most stars.
+_FRAMES_PER_EXPOSURE = 6
+
+# In a mosaic stars of the neighbors within this share of a detector's longer side help.
+_MARGIN = 0.35
+
+# First guess of a field's amplitude in units of the stars' errors.
+_FIRST_AMPLITUDE = 1.0
+
+
+def _box(o, state, k, margin):
+    """Corners of the part of the focal plane that a detector covers, px."""
+    detector = o.detectors[k]
+    focal = state.model.geometry.focal(k, detector, *detector.grid(2))
+    margin = margin * max(detector.image_shape)
+    return focal.min(1) - margin, focal.max(1) + margin
+
+
+def _margin(o):
+    return _MARGIN if len(o.detectors) > 1 else 0.0
+
+
+def with_spectra(o, state, *, force=False):
+    """State with waves for each detector and a spectrum for each exposure.
+
+    Parameters
+    ----------
+    o : Observations
+        Pairs.
+    state : State
+        Where the solution stands; its fields are not looked at.
+    force : bool, optional
+        Give every exposure a field, whatever the evidence.
+
+    Returns
+    -------
+    State
+        Exposures whose stars do not speak for a field have none.
+    """
+    counts = np.array([state.kept[s].sum() for s in o.slices])
+    bases = {}
+    for k in range(len(o.detectors)):
+        mine = counts[(o.detector_of == k)]
+        n = int(np.clip(np.median(mine) / _STARS_PER_WAVE_MARGINAL, 12, _MOST_MARGINAL))
+        bases[k] = patch(*_box(o, state, k, 0.3 * _margin(o)), n)
+    groups = {}
+    for f in state.active:
+        if counts[f] > 0:
+            groups.setdefault(int(o.exposure_of[f]), []).append(f)
+    frames = {
+        e: sorted(fs, key=lambda f: -counts[f])[:_FRAMES_PER_EXPOSURE] for e, fs in groups.items()
+    }
+    plain = replace(state, spectra={}, bases=bases)
+
+    def make(f, kinds):
+        return _products(o, plain, f, bases[int(o.detector_of[f])], kinds)
+
+    errors = np.sqrt(np.median(state.sigma[:, state.kept] ** 2))
+    areas = [np.prod(2 * b.half) for b in bases.values()]
+    spacing = np.sqrt(np.median(areas) / max(np.median(counts[counts > 0]), 1))
+    longest = max(2 * b.half.max() for b in bases.values())
+    spectra = learn_spectra(
+        frames, make, start=_FIRST_AMPLITUDE * errors, force=force,
+        scales=(min(2 * spacing, 0.5 * longest), 4 * longest),
+    )  # fmt: skip
+    return replace(plain, spectra=spectra)
+
+
+def _products(o, state, f, basis: Basis, kinds):
+    s = o.slices[f]
+    kept = state.kept[s]
+    residual, focal = residuals(state.model, o, f, with_field=False)
+    variance = state.noise(o, f)[:, kept]
+    nuisance = None
+    if len(o.detectors) == 1:
+        # A single exposure's polynomial has taken what it could of the field.
+        columns = design(state.model, o, f, o.x[s][kept], o.y[s][kept], o.color[s][kept])
+        own = sum(t.size for t in state.model.scoped("exposure"))
+        nuisance = columns if o.n_exposures == 1 else columns[:, :, -own:]
+    return products(
+        basis, focal[:, kept], -residual[:, kept], 1.0 / variance, nuisance=nuisance, kinds=kinds
+    )
+
+
+def with_fields(o, state):
+    """State with the posterior of the field in every frame whose exposure has a spectrum.
+
+    Parameters
+    ----------
+    o : Observations
+        Pairs.
+    state : State
+        With spectra.
+
+    Returns
+    -------
+    State
+        With fields.
+    """
+    fields = {}
+    plain = replace(state, model=replace(state.model, fields={}))
+    for e in range(o.n_exposures):
+        spectrum = state.spectra.get(e)
+        frames = [f for f in o.frames_of(e) if state.reason[f] is None]
+        if spectrum is None or not frames:
+            continue
+        stars = [_stars(o, plain, f) for f in frames]
+        focal, residual, variance = (
+            np.concatenate([star[i] for star in stars], axis=1) for i in range(3)
+        )
+        for f in frames:
+            low, high = _box(o, state, int(o.detector_of[f]), _margin(o))
+            near = np.all((focal > low[:, None]) & (focal < high[:, None]), axis=0)
+            n = int(np.clip(near.sum() / _STARS_PER_WAVE, 12, _MOST_FINAL))
+            fields[f] = fit_field(
+                patch(low, high, n), spectrum, focal[:, near], residual[:, near],
+                variance[:, near],
+            )  # fmt: skip
+    return replace(state, model=replace(state.model, fields=fields))
+
+
+def with_statics(o, state):
+    """State with a smooth field for each detector of a mosaic, shared by its exposures.
+
+    The spectrum is learnt from all detectors: what one of them cannot tell of its own few stars,
+    the others tell of its kind.
+
+    Parameters
+    ----------
+    o : Observations
+        Pairs.
+    state : State
+        Where the solution stands.
+
+    Returns
+    -------
+    State
+        Detectors whose stars do not speak for a field have none.
+    """
+    plain = replace(state, model=replace(state.model, statics={}))
+    stars = {}
+    for k in range(len(o.detectors)):
+        parts = [_stars(o, plain, f) for f in state.active if o.detector_of[f] == k]
+        if parts:
+            stars[k] = [np.concatenate([p[i] for p in parts], axis=1) for i in range(3)]
+    boxes = {k: _box(o, state, k, 0.0) for k in stars}
+    counts = {k: columns[0].shape[1] for k, columns in stars.items()}
+    typical = float(np.median(list(counts.values())))
+    n = int(np.clip(typical, 12, _MOST_STATIC))
+
+    def make(k, kinds):
+        focal, residual, variance = stars[k]
+        return products(patch(*boxes[k], n), focal, residual, 1.0 / variance,
+                        nuisance=_affine(focal), kinds=kinds)  # fmt: skip
+
+    longest = max(float(np.max(high - low)) for low, high in boxes.values())
+    spacing = longest / np.sqrt(max(typical, 1.0))
+    errors = np.sqrt(np.median(state.sigma[:, state.kept] ** 2))
+    spectra = learn_spectra(
+        {k: [k] for k in stars}, make, start=0.3 * errors, pool=len(stars),
+        scales=(min(2 * spacing, 0.5 * longest), 4 * longest),
+    )  # fmt: skip
+    statics = {}
+    for k, spectrum in spectra.items():
+        if spectrum is not None:
+            statics[k] = fit_field(patch(*boxes[k], n), spectrum, *stars[k])
+    return replace(state, model=replace(state.model, statics=statics))
+
+
+def _affine(focal):
+    """Columns of a shift and a linear map, which a detector's place takes."""
+    middle = focal - focal.mean(1, keepdims=True)
+    rows = np.stack([np.ones(focal.shape[1]), *(middle / np.abs(middle).max())], axis=1)
+    zero = np.zeros_like(rows)
+    return np.array([np.hstack([rows, zero]), np.hstack([zero, rows])])
+
+
+def _stars(o, state, f):
+    s = o.slices[f]
+    kept = state.kept[s]
+    residual, focal = residuals(state.model, o, f)
+    variance = focal_variance(state.model, o, f, state.sigma[:, s])
+    return focal[:, kept], -residual[:, kept], variance[:, kept]

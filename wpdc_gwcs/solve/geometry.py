@@ -1,0 +1,231 @@
+"""Where detectors stand in the focal plane, and where exposures point.
+
+::
+
+    pixel --[place: P + M (x - CRPIX)]--> focal plane (px) --[pointing q, matrix R]--> sky
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wpdc_gwcs.fitting import fit_attitude
+from wpdc_gwcs.models import deproject, project
+
+__all__ = ["Geometry", "start_geometry"]
+
+# Sky positions of a frame that stand for its linear WCS, along each axis.
+_POINTS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """The linear part of a camera and its exposures.
+
+    The focal plane is in px along the axes of its first detector, so that one detector alone is
+    its own focal plane.
+
+    Parameters
+    ----------
+    place : (D, 2) ndarray
+        Focal plane position of each detector's reference point, px.
+    matrix : (D, 2, 2) ndarray
+        Focal plane px per detector px.
+    pointing : (E, 2) ndarray
+        Right ascension and declination of the origin of the focal plane, deg.
+    cd : (E, 2, 2) ndarray
+        Tangent plane deg per focal plane px.
+    radius : float
+        Reach of the focal plane about its origin, px.
+    """
+
+    place: np.ndarray
+    matrix: np.ndarray
+    pointing: np.ndarray
+    cd: np.ndarray
+    radius: float
+
+    def focal(self, k, detector, x, y):
+        """Focal plane position of pixels of detector number ``k``, without any distortion.
+
+        Parameters
+        ----------
+        k : int
+            Number of the detector.
+        detector : Detector
+            The detector.
+        x : (N,) ndarray
+            Pixels along x.
+        y : (N,) ndarray
+            Pixels along y.
+        """
+        offset = np.array([x - detector.crpix[0], y - detector.crpix[1]])
+        return self.place[k][:, None] + self.matrix[k] @ offset
+
+    def reference(self, exposure, ra, dec):
+        """Focal plane position of sky positions in one exposure, ``(2, N)``, px.
+
+        Parameters
+        ----------
+        exposure : int
+            Number of the exposure.
+        ra : (N,) ndarray
+            Right ascensions, deg.
+        dec : (N,) ndarray
+            Declinations, deg.
+        """
+        plane = np.array(project(ra, dec, self.pointing[exposure]))
+        return np.linalg.solve(self.cd[exposure], plane)
+
+    def sky(self, exposure, focal):
+        """Sky position of the focal plane in one exposure, deg.
+
+        Parameters
+        ----------
+        exposure : int
+            Number of the exposure.
+        focal : (2, N) ndarray
+            Focal plane, px.
+        """
+        return deproject(*(self.cd[exposure] @ focal), self.pointing[exposure])
+
+    def moved(self, exposure, shift, matrix):
+        """Pointing and CD of an exposure once ``shift + matrix @ focal`` replaces ``focal``.
+
+        Parameters
+        ----------
+        exposure : int
+            Number of the exposure.
+        shift : (2,) ndarray
+            Of the focal plane, px.
+        matrix : (2, 2) ndarray
+            Of the focal plane.
+        """
+        cd = self.cd[exposure]
+        return np.array(deproject(*(cd @ shift), self.pointing[exposure])), cd @ matrix
+
+
+def start_geometry(observations):
+    """Places of all detectors and pointings of all exposures from the linear WCS of the frames.
+
+    Parameters
+    ----------
+    observations : Observations
+        Its frames bring a CRVAL and a CD each.
+
+    Returns
+    -------
+    Geometry
+        Places that agree with the frames' own attitudes.
+    """
+    o = observations
+    n_detectors, n_exposures = len(o.detectors), o.n_exposures
+    if n_detectors == 1:
+        cd = np.array([np.asarray(f.cd, float) for f in o.frames])
+        detector = o.detectors[0]
+        corners = np.array(detector.grid(2)) - detector.crpix[:, None]
+        return Geometry(
+            place=np.zeros((1, 2)),
+            matrix=np.eye(2)[None],
+            pointing=_by_exposure(o, [np.asarray(f.crval, float) for f in o.frames]),
+            cd=_by_exposure(o, cd),
+            radius=float(np.hypot(*corners).max()),
+        )
+    return _start_mosaic(o, n_detectors, n_exposures)
+
+
+def _by_exposure(o, values):
+    """One value for each exposure: that of its first frame."""
+    return np.array([values[o.frames_of(e)[0]] for e in range(o.n_exposures)])
+
+
+def _start_mosaic(o, n_detectors, n_exposures):
+    # The exposure with the most detectors holds the focal plane; others join by what they share.
+    size = np.bincount(o.exposure_of, minlength=n_exposures)
+    points = [_points(f, o.detector(k)) for k, f in enumerate(o.frames)]
+    place, matrix = np.full((n_detectors, 2), np.nan), np.full((n_detectors, 2, 2), np.nan)
+    pointing, cd = np.full((n_exposures, 2), np.nan), np.full((n_exposures, 2, 2), np.nan)
+    todo = set(range(n_exposures))
+    first = int(np.argmax(size))
+    while todo:
+        known = np.isfinite(place[:, 0])
+        shared = {e: int(known[o.detector_of[o.frames_of(e)]].sum()) for e in todo}
+        e = max(todo, key=lambda e: (shared[e], size[e]))
+        if not shared[e]:
+            # Nothing in common with what is known: a focal plane of its own about the same origin.
+            e = first if first in todo else e
+            frames = o.frames_of(e)
+            centers = np.array([points[k][1][:, 0] for k in frames])
+            pointing[e] = _mean_direction(centers)
+            cd[e] = _first_matrix(o.frames[frames[0]], pointing[e])
+        else:
+            frames = [k for k in o.frames_of(e) if known[o.detector_of[k]]]
+            pointing[e], cd[e] = _fit_pointing(o, frames, points, place, matrix, cd[first])
+        todo.discard(e)
+        for k in o.frames_of(e):
+            d = o.detector_of[k]
+            if not known[d]:
+                place[d], matrix[d] = _place_of(points[k], o.detectors[d], pointing[e], cd[e])
+    corners = np.concatenate(
+        [
+            place[d][:, None] + matrix[d] @ (np.array(det.grid(2)) - det.crpix[:, None])
+            for d, det in enumerate(o.detectors)
+        ],
+        axis=1,
+    )
+    return Geometry(place, matrix, pointing, cd, float(np.hypot(*corners).max()))
+
+
+def _points(frame, detector):
+    """Pixels about the reference point, and their sky by the frame's own linear WCS."""
+    x, y = detector.grid(_POINTS)
+    x, y = np.append(detector.center[0], x), np.append(detector.center[1], y)
+    offset = np.array([x, y]) - detector.crpix[:, None]
+    return offset, np.array(deproject(*(np.asarray(frame.cd, float) @ offset), frame.crval))
+
+
+def _mean_direction(sky):
+    ra, dec = np.radians(np.asarray(sky)).T
+    x, y, z = np.mean([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+    return np.degrees([np.arctan2(y, x) % (2 * np.pi), np.arctan2(z, np.hypot(x, y))])
+
+
+def _first_matrix(frame, pointing):
+    """CD of the first frame as it is on the tangent plane about another point."""
+    cd, crval = np.asarray(frame.cd, float), np.asarray(frame.crval, float)
+    step = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    plane = np.array(project(*deproject(*(cd @ step), crval), pointing))
+    return plane[:, 1:] - plane[:, :1]
+
+
+def _fit_pointing(o, frames, points, place, matrix, start):
+    focal = np.concatenate(
+        [
+            place[o.detector_of[k]][:, None] + matrix[o.detector_of[k]] @ points[k][0]
+            for k in frames
+        ],
+        axis=1,
+    )
+    sky = np.concatenate([points[k][1] for k in frames], axis=1)
+    fit = fit_attitude(
+        *focal, *sky, crpix=(0.0, 0.0), crval=_mean_direction(sky.T), cd=_turned(focal, sky, start),
+        clip=np.inf,
+    )  # fmt: skip
+    return fit.crval, fit.cd
+
+
+def _turned(focal, sky, start):
+    """Fit the starting CD of an exposure of any roll, on the plane about its own middle."""
+    plane = np.array(project(*sky, _mean_direction(sky.T)))
+    a = focal - focal.mean(1, keepdims=True)
+    b = plane - plane.mean(1, keepdims=True)
+    matrix = np.linalg.lstsq(a.T, b.T, rcond=None)[0].T
+    return matrix if np.linalg.matrix_rank(matrix) == 2 else start
+
+
+def _place_of(points, detector, pointing, cd):
+    offset, sky = points
+    focal = np.linalg.solve(cd, np.array(project(*sky, pointing)))
+    rows = np.stack([np.ones(offset.shape[1]), *offset], axis=1)
+    fit = np.linalg.lstsq(rows, focal.T, rcond=None)[0]
+    return fit[0], fit[1:].T

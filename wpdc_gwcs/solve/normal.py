@@ -1,0 +1,282 @@
+"""Normal equations: accumulated frame by frame, solved by eliminating what is local.
+
+::
+
+    frame: residual, designs, noise, field --frame_equations--> its products
+    products of all frames --"+"--> Blocks of camera, detectors and exposures
+    Blocks, priors --posterior--> means, and covariances of any detector in any exposure
+
+Detectors meet only through the camera and the exposures, exposures only through the camera and the
+detectors: whichever of the two is larger is eliminated (Schur complement), so that cost and memory
+grow linearly with it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, lapack
+
+__all__ = ["Blocks", "Posterior", "accumulate", "frame_equations", "invert", "posterior"]
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Normal matrix and right-hand side by the scope of the unknowns.
+
+    Parameters
+    ----------
+    camera, detectors, exposures : (C, C), (D, P, P) and (E, K, K) ndarray
+        Diagonal blocks.
+    camera_detectors, camera_exposures : (D, C, P) and (E, C, K) ndarray
+        Of the camera's unknowns with those of each detector and exposure.
+    frames : dict
+        (detector, exposure) to the block ``(P, K)`` of their unknowns.
+    right : tuple of ndarray
+        ``(C,)``, ``(D, P)`` and ``(E, K)``.
+    """
+
+    camera: np.ndarray
+    detectors: np.ndarray
+    exposures: np.ndarray
+    camera_detectors: np.ndarray
+    camera_exposures: np.ndarray
+    frames: dict
+    right: tuple
+
+
+def frame_equations(design, residual, weight, *, field=None):
+    """Accumulate the rows of one frame.
+
+    Parameters
+    ----------
+    design : (2, N, P) ndarray
+        Columns of the unknowns.
+    residual, weight : (2, N) ndarray
+        Residuals and inverse variances, px.
+    field : (basis, prior), optional
+        Design ``(2, N, M)`` and prior variances ``(M,)`` of the frame's field, which is
+        marginalized: the noise covariance becomes diag(1 / weight) + basis prior basis^T.
+
+    Returns
+    -------
+    matrix, right : (P, P) and (P,) ndarray
+        Normal matrix and right-hand side.
+    """
+    n = design.shape[2]
+    rows = design.reshape(-1, n)
+    w = weight.ravel()
+    weighted = rows * w[:, None]
+    both = np.column_stack([rows, residual.ravel()])
+    products = weighted.T @ both
+    matrix, right = products[:, :n], products[:, n]
+    if field is not None:
+        basis, prior = field
+        basis = basis.reshape(-1, basis.shape[2])
+        heavy = basis * w[:, None]
+        root = np.sqrt(prior)
+        inner = (basis.T @ heavy) * root[:, None] * root
+        inner[np.diag_indices_from(inner)] += 1.0
+        cross = (heavy.T @ both) * root[:, None]
+        solved = cho_solve(cho_factor(inner, lower=True, check_finite=False), cross)
+        correction = cross[:, :n].T @ solved
+        matrix, right = matrix - correction[:, :n], right - correction[:, n]
+    return matrix, right
+
+
+def invert(matrix):
+    """Inverse of a symmetric positive definite matrix.
+
+    Parameters
+    ----------
+    matrix : ndarray
+        Of the focal plane, or what is inverted.
+    """
+    root = _inverse_root(matrix)
+    return root.T @ root
+
+
+def _inverse_root(matrix):
+    """Matrix R with R^T R the inverse of a symmetric matrix, scaled to a unit diagonal first."""
+    if not matrix.size:
+        return np.zeros_like(matrix)
+    diagonal = np.diagonal(matrix)
+    # Elimination may leave nothing but rounding of what is not determined.
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-15 * diagonal.max()))
+    scaled = matrix * scale[:, None] * scale
+    factor, info = lapack.dpotrf(scaled, lower=1, clean=1)
+    if info == 0:
+        root, info = lapack.dtrtri(factor, lower=1)
+    if info != 0:
+        # Singular to rounding: what is not determined keeps what little the prior says.
+        values, vectors = np.linalg.eigh(scaled)
+        values = np.maximum(values, values[-1] * 1e-15)
+        root = (vectors / np.sqrt(values)).T
+    return root * scale
+
+
+def accumulate(products, sizes, counts):
+    """Add the products of all frames.
+
+    Parameters
+    ----------
+    products : iterable of (int, int, ndarray, ndarray)
+        Detector, exposure, normal matrix and right-hand side of each frame; its unknowns are those
+        of the camera, of the detector and of the exposure, in that order.
+    sizes : (int, int, int)
+        Unknowns of the camera, of a detector, of an exposure.
+    counts : (int, int)
+        Detectors and exposures.
+
+    Returns
+    -------
+    Blocks
+        Sums.
+    """
+    c, p, k = sizes
+    d, e = counts
+    camera, right = np.zeros((c, c)), (np.zeros(c), np.zeros((d, p)), np.zeros((e, k)))
+    detectors, exposures = np.zeros((d, p, p)), np.zeros((e, k, k))
+    camera_detectors, camera_exposures = np.zeros((d, c, p)), np.zeros((e, c, k))
+    frames = {}
+    first, second = slice(0, c), slice(c, c + p)
+    third = slice(c + p, c + p + k)
+    for i, j, matrix, vector in products:
+        camera += matrix[first, first]
+        detectors[i] += matrix[second, second]
+        exposures[j] += matrix[third, third]
+        camera_detectors[i] += matrix[first, second]
+        camera_exposures[j] += matrix[first, third]
+        frames[i, j] = frames.get((i, j), 0.0) + matrix[second, third]
+        right[0][:] += vector[first]
+        right[1][i] += vector[second]
+        right[2][j] += vector[third]
+    return Blocks(camera, detectors, exposures, camera_detectors, camera_exposures, frames, right)
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Solution of the normal equations.
+
+    Parameters
+    ----------
+    camera, detectors, exposures : (C,), (D, P) and (E, K) ndarray
+        Unknowns.
+    conditional : (E, K, K) ndarray
+        Covariance of an exposure's unknowns with all others fixed.
+    """
+
+    camera: np.ndarray
+    detectors: np.ndarray
+    exposures: np.ndarray
+    conditional: np.ndarray
+    _globals: np.ndarray  # covariance of the unknowns that were not eliminated
+    _inverse: np.ndarray  # of the blocks that were
+    _response: np.ndarray  # minus their change with the others
+    _local_detectors: bool
+
+    def joint(self, detector, exposure):
+        """Covariance of the unknowns of camera, one detector and one exposure.
+
+        Parameters
+        ----------
+        detector, exposure : int
+            Which.
+
+        Returns
+        -------
+        (C + P + K, C + P + K) ndarray
+            In that order.
+        """
+        c, p, k = len(self.camera), self.detectors.shape[1], self.exposures.shape[1]
+        if self._local_detectors:
+            local, start, size = detector, c + exposure * k, k
+        else:
+            local, start, size = exposure, c + detector * p, p
+        chosen = np.concatenate([np.arange(c), np.arange(start, start + size)])
+        response = self._response[local]
+        mixed = -response @ self._globals
+        own = self._inverse[local] - mixed @ response.T
+        both = self._globals[np.ix_(chosen, chosen)]
+        mixed = mixed[:, chosen]
+        order = np.argsort(
+            np.concatenate([np.arange(c), (c + p if self._local_detectors else c) + np.arange(size),
+                            (c if self._local_detectors else c + p) + np.arange(len(own))]),
+            kind="stable",
+        )  # fmt: skip
+        joint = np.block([[both, mixed.T], [mixed, own]])
+        return joint[np.ix_(order, order)]
+
+    def variances(self):
+        """Variances of the unknowns of the camera and of all detectors, ``(C,)``, ``(D, P)``."""
+        c, p = len(self.camera), self.detectors.shape[1]
+        outer = np.diagonal(self._globals)
+        if not self._local_detectors:
+            return outer[:c], outer[c:].reshape(len(self.detectors), p)
+        own = np.einsum("dii->di", self._inverse)
+        spread = np.einsum("dpg,gh,dph->dp", self._response, self._globals, self._response,
+                           optimize=True)  # fmt: skip
+        return outer[:c], own + spread
+
+
+def posterior(blocks, camera, detectors, exposures, pulls):
+    """Solve the normal equations with priors.
+
+    Parameters
+    ----------
+    blocks : Blocks
+        Equations.
+    camera, detectors : (C,) and (D, P) ndarray
+        Prior inverse variances.
+    exposures : (E, K, K) ndarray
+        Prior inverse covariances.
+    pulls : tuple of ndarray
+        What the priors add to the right-hand sides.
+
+    Returns
+    -------
+    Posterior
+        Means and covariances.
+    """
+    right = [r + pull for r, pull in zip(blocks.right, pulls)]
+    c, (d, p), (e, k) = len(right[0]), right[1].shape, right[2].shape
+    own_detectors = blocks.detectors + detectors[:, :, None] * np.eye(p)
+    own_exposures = blocks.exposures + exposures
+    # One detector's polynomial may be all but free where its stars are few: it stays to the last.
+    local_detectors = d > 1 and d * p > e * k
+    if local_detectors:
+        local, rest, n, m = own_detectors, own_exposures, d, e
+        to_camera, rest_camera = blocks.camera_detectors, blocks.camera_exposures
+        local_right, rest_right, size = right[1], right[2], k
+    else:
+        local, rest, n, m = own_exposures, own_detectors, e, d
+        to_camera, rest_camera = blocks.camera_exposures, blocks.camera_detectors
+        local_right, rest_right, size = right[2], right[1], p
+    total = c + m * size
+    matrix = np.zeros((total, total))
+    matrix[:c, :c] = blocks.camera + np.diag(camera)
+    for j in range(m):
+        s = slice(c + j * size, c + (j + 1) * size)
+        matrix[s, s] = rest[j]
+        matrix[:c, s], matrix[s, :c] = rest_camera[j], rest_camera[j].T
+    cross = np.zeros((n, local.shape[1], total))
+    cross[:, :, :c] = to_camera.transpose(0, 2, 1)
+    for (i, j), block in blocks.frames.items():
+        if local_detectors:
+            cross[i][:, c + j * size : c + (j + 1) * size] = block
+        else:
+            cross[j][:, c + i * size : c + (i + 1) * size] = block.T
+    vector = np.concatenate([right[0], rest_right.ravel()])
+    inverse, response = np.empty_like(local), np.empty_like(cross)
+    for i in range(n):
+        root = _inverse_root(local[i])
+        half = root @ cross[i]
+        matrix -= half.T @ half
+        vector -= half.T @ (root @ local_right[i])
+        inverse[i], response[i] = root.T @ root, root.T @ half
+    covariance = invert(matrix) if total else np.zeros((0, 0))
+    outer = covariance @ vector
+    inner = np.einsum("npq,nq->np", inverse, local_right) - response @ outer
+    rest = outer[c:].reshape(m, size)
+    found = (inner, rest) if local_detectors else (rest, inner)
+    conditional = np.array([invert(one) for one in own_exposures]) if local_detectors else inverse
+    return Posterior(outer[:c], *found, conditional, covariance, inverse, response, local_detectors)
