@@ -8,7 +8,12 @@ from astropy.table import Table
 from numpy.testing import assert_allclose
 
 from wpdc_gwcs import Calibration, DistortionSolution, PVPolynomial
-from wpdc_gwcs.calibration.checks import check_solution, coverage, shortcomings
+from wpdc_gwcs.calibration.checks import (
+    check_solution,
+    coverage,
+    largest_hole,
+    shortcomings,
+)
 from wpdc_gwcs.evaluation import evaluate
 from wpdc_gwcs.exceptions import FitError
 
@@ -201,3 +206,19 @@ class TestShortcomings:
         case.frame.epoch = None
         case.frame.diagnostics.completeness = 0.1
         assert [r.split()[1] for r in case.lacks()] == ["300", "map", "of", "frame"]
+
+
+class TestLargestHole:
+    def test_empty_middle(self, rng):
+        """Stars along the rim span all of the detector and say nothing of its middle."""
+        t = rng.uniform(-1, 1, (2, 4000))
+        x, y = 500 * (t[:, np.abs(t).max(axis=0) > 0.8] + 1)
+        assert coverage(x, y, (1000, 1000)) > 0.98
+        assert_allclose(largest_hole(x, y, (1000, 1000)), np.pi * 0.4**2, rtol=0.05)
+
+    def test_stars_all_over(self, rng):
+        x, y = rng.uniform(0, 4000, 200), rng.uniform(0, 128, 200)
+        assert largest_hole(x, y, (128, 4000)) < 0.1
+
+    def test_no_stars(self):
+        assert largest_hole([], [], (10, 10)) == 1.0

@@ -5,7 +5,7 @@ degraded, with the reasons.
 """
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from wpdc_gwcs.evaluation import binned_residuals
 from wpdc_gwcs.exceptions import FitError
@@ -29,6 +29,13 @@ _STORED_RATIO = 5.0
 
 # The stars' outline covers so much of the detector; random stars do from about 35 on.
 _MIN_COVERAGE = 0.7
+
+# Share of the detector that a circle without stars may cover: random stars hardly ever leave one so
+# large from 20 on, stars along the rim always do.
+_MAX_HOLE = 0.35
+
+# Points along each axis at which circles are centered.
+_HOLE_NODES = 41
 
 # Uncertainty of the map, px, and the share of the detector that may exceed it.
 _MAX_MAP_SIGMA, _UNCERTAIN_SHARE = 0.25, 0.05
@@ -114,11 +121,16 @@ def shortcomings(frame, calibration, *, held, known=False):
     used = np.asarray(matches["used"])
     x, y = np.asarray(matches["x"], float)[used], np.asarray(matches["y"], float)[used]
     share = coverage(x, y, frame.image_shape)
-    if share < _MIN_COVERAGE and not known:
+    hole = largest_hole(x, y, frame.image_shape)
+    if known:
+        pass  # other frames have stars where this one has none
+    elif share < _MIN_COVERAGE:
         reasons.append(
             f"its {used.sum()} stars span {share:.0%} of the detector (x {x.min():.0f} to "
             f"{x.max():.0f} of {nx} px, y {y.min():.0f} to {y.max():.0f} of {ny})"
         )
+    elif hole > _MAX_HOLE:
+        reasons.append(f"a circle of {hole:.0%} of the detector has none of its {used.sum()} stars")
     sigma = np.max(np.asarray(calibration.sigma)[:2], axis=0)
     uncertain = float(np.mean(~(sigma <= _MAX_MAP_SIGMA)))
     if uncertain > _UNCERTAIN_SHARE:
@@ -167,6 +179,34 @@ def coverage(x, y, image_shape):
         return float(ConvexHull(np.stack([x, y], axis=1)).volume / np.prod(image_shape))
     except QhullError:
         return 0.0
+
+
+def largest_hole(x, y, image_shape):
+    """Share of a detector that the largest circle without stars covers.
+
+    Parameters
+    ----------
+    x, y : (N,) array_like
+        Pixels of the stars.
+    image_shape : (int, int)
+        Shape ``(ny, nx)``.
+
+    Returns
+    -------
+    float
+        Area of the circle, with the detector stretched to a square, over that of the detector;
+        1 where there are no stars.
+    """
+    if not len(x):
+        return 1.0
+    ny, nx = image_shape
+    nodes = (np.arange(_HOLE_NODES) + 0.5) / _HOLE_NODES
+    u, v = (a.ravel() for a in np.meshgrid(nodes, nodes))
+    stars = np.stack([(np.asarray(x) + 0.5) / nx, (np.asarray(y) + 0.5) / ny], axis=1)
+    distance, _ = cKDTree(stars).query(np.stack([u, v], axis=1))
+    # Circles that reach over the rim would be as large for stars all over the detector.
+    rim = np.min([u, 1 - u, v, 1 - v], axis=0)
+    return float(np.pi * np.max(np.minimum(distance, rim)) ** 2)
 
 
 def _area_range(calibration, nx, ny):

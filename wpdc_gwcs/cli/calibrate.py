@@ -171,7 +171,8 @@ def calibrate_command(
     """Calibrate frames: detect, match, fit and write one WCS file each.
 
     Writes STEM.wcs.asdf and STEM.matches.ecsv for each solved frame (and STEM.sources.ecsv for
-    images), DETECTOR.solution.asdf for each detector, and summary.ecsv.  Exit status 1 if a frame
+    images), DETECTOR.solution.asdf for each detector, and summary.ecsv.  A frame that lacks
+    something is delivered as degraded, and the summary says what.  Exit status 1 if a frame
     was not solved: it has no WCS file, and its row of the summary says why.
     """
     from wpdc_gwcs.calibration import Settings, calibrate
@@ -234,6 +235,11 @@ def calibrate_command(
         write_page(run.summary, run.solutions, tables, output / "report.html", overwrite=overwrite)
     if not quiet:
         print_summary(run, output)
+    for calibration in run.calibrations:
+        if calibration.statistics["reasons"]:
+            log.warning(
+                "%s: degraded: %s", calibration.frame, "; ".join(calibration.statistics["reasons"])
+            )
     for name, error in run.failures.items():
         log.error("%s: not solved: %s", name, error)
     if any(isinstance(error, InputError) for error in run.failures.values()):
@@ -417,14 +423,16 @@ def print_summary(run, folder):
     """
     width = max([len("frame"), *(len(name) for name in run.summary["frame"])])
     typer.echo(
-        f"{'frame':<{width}}  status  sources  matched  sigma_dx  sigma_dy  rms_mas  seconds"
+        f"{'frame':<{width}}  status    sources  matched  sigma_dx  sigma_dy  rms_mas  seconds"
     )
     for row in run.summary:
         typer.echo(
-            f"{row['frame']:<{width}}  {row['status']:<6}  {row['n_sources']:7d}  "
+            f"{row['frame']:<{width}}  {row['status']:<8}  {row['n_sources']:7d}  "
             f"{row['n_matched']:7d}  "
             f"{float(row['sigma_dx'].value):8.4f}  {float(row['sigma_dy'].value):8.4f}  "
             f"{float(row['rms_mas'].value):7.2f}  {float(row['seconds'].value):7.2f}"
         )
     n = len(run.calibrations)
-    typer.echo(f"{n} of {len(run.summary)} frames solved; results in {os.fspath(folder)}")
+    degraded = sum(row["status"] == "degraded" for row in run.summary)
+    also = f", {degraded} of them degraded" if degraded else ""
+    typer.echo(f"{n} of {len(run.summary)} frames solved{also}; results in {os.fspath(folder)}")

@@ -167,6 +167,8 @@ def read_asdf_wcs(path):
 
 
 def _write_tree(tree, path, overwrite, compression=None):
+    # A context copies what is loaded: extensions are to be looked for once, not for every file.
+    _ = asdf.get_config().extensions
     with atomic_path(path, overwrite=overwrite) as temporary, asdf.config_context() as config:
         # Small arrays stay legible.
         config.array_inline_threshold = 64

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-__all__ = ["learn_sequence"]
+__all__ = ["inflation", "learn_sequence"]
 
 # Scatter of the logarithm of a group's size about what the group before it lets one expect.  Broad:
 # one degree of a distortion may well be ten times another.
@@ -36,17 +36,11 @@ def learn_sequence(square, count, sigma, decay):
     that a degree about which the stars say nothing is taken to be somewhat smaller than the one
     below it, and never to be zero.
     """
-    walk = np.zeros((len(count), len(count)))
+    walk = _walk(len(count))
+    # (l_i - l_{i-1} + ln decay)^2 / (2 scatter^2), its gradient at zero
     offset = np.zeros(len(count))
-    for i in range(1, len(count)):
-        # (l_i - l_{i-1} + ln decay)^2 / (2 scatter^2)
-        walk[i, i] += 1
-        walk[i - 1, i - 1] += 1
-        walk[i, i - 1] -= 1
-        walk[i - 1, i] -= 1
-        offset[i] += np.log(decay)
-        offset[i - 1] -= np.log(decay)
-    walk, offset = walk / _LOG_SCATTER**2, offset / _LOG_SCATTER**2
+    offset[1:] += np.log(decay) / _LOG_SCATTER**2
+    offset[:-1] -= np.log(decay) / _LOG_SCATTER**2
     log = np.log(sigma)
     for _ in range(_NEWTON_STEPS):
         chi = square * np.exp(-2 * log)
@@ -56,3 +50,32 @@ def learn_sequence(square, count, sigma, decay):
         if np.abs(step).max() < 1e-6:
             break
     return np.exp(log)
+
+
+def inflation(determined):
+    """Factors of a sequence of standard deviations for what is not known of them.
+
+    Parameters
+    ----------
+    determined : (G,) ndarray
+        Number of coefficients of each group that the stars determine.
+
+    Returns
+    -------
+    (G,) ndarray
+        1 where many coefficients tell the size of their group, and larger the fewer there are.
+
+    Notes
+    -----
+    The logarithm of a standard deviation is known to v = 1 / (2 n) from n coefficients, and from
+    its neighbors by the random walk; for a normal distribution of the logarithm, the mean of the
+    variance is exp(2 v) times its mode.
+    """
+    precision = _walk(len(determined)) + np.diag(2.0 * np.maximum(determined, 1e-3))
+    return np.exp(np.diagonal(np.linalg.inv(precision)))
+
+
+def _walk(n):
+    """Precision of a random walk of n steps of the logarithm."""
+    step = np.diff(np.eye(n), axis=0)
+    return step.T @ step / _LOG_SCATTER**2

@@ -16,7 +16,7 @@ from wpdc_gwcs.solve.errors import (
     frame_scale,
     linear_scatter,
 )
-from wpdc_gwcs.solve.evidence import learn_sequence
+from wpdc_gwcs.solve.evidence import inflation, learn_sequence
 from wpdc_gwcs.solve.model import Model, block, design, focal_variance, residuals
 from wpdc_gwcs.solve.normal import Posterior, accumulate, frame_equations, posterior
 
@@ -172,6 +172,10 @@ def linear_step(o, state, *, learn=10, pool=True):
             sigma = _learned(scopes, sigma, values, found)
     model = _applied(model, scopes, values, found, sigma)
     freedom = _freedom(found, priors, own)
+    # The means are those of the most probable variances, the errors know that these are uncertain.
+    wide = _inflated(scopes, sigma, found)
+    priors = [np.broadcast_to(_precision(t, wide), v.shape) for t, v in zip(scopes, values)]
+    found = posterior(blocks, *priors, own, (*pulls, own_pull))
     state = replace(
         state, model=model, own=blocks.exposures + own, posterior=found, freedom=freedom
     )
@@ -208,6 +212,21 @@ def _learned(scopes, sigma, values, found):
             else:
                 out[t.name] = np.sqrt(total / count)
             out[t.name] = np.maximum(out[t.name], _LEAST_SIGMA)
+    return out
+
+
+def _inflated(scopes, sigma, found):
+    """Widen the standard deviations of all groups by what is not known of them."""
+    out = dict(sigma)
+    for terms, variance in zip(scopes, found.variances()):
+        variance = np.atleast_2d(variance)
+        place = 0
+        for t in terms:
+            mine = variance[:, place : place + t.size] / sigma[t.name][t.groups] ** 2
+            place += t.size
+            if t.decay:
+                known = np.bincount(t.groups, np.sum(1.0 - mine, axis=0), len(t.start))
+                out[t.name] = sigma[t.name] * inflation(known)
     return out
 
 
