@@ -4,6 +4,7 @@ python benchmarks/matching.py                          all of it, briefly
 python benchmarks/matching.py lab --seeds 1 2 3        cases of the lab (see below)
 python benchmarks/matching.py random --n 1000          random solvable cases
 python benchmarks/matching.py impossible --n 1000      cases that must be refused
+python benchmarks/matching.py few-impossible --n 300   the same with 15 to 40 sources
 python benchmarks/matching.py blind --n 100            mirrored, turned, wrong scale or pointing
 python benchmarks/matching.py hard --n 100             random cases beyond that range
 python benchmarks/matching.py times                    1e3 to 1e6 stars; memory; peers beside
@@ -292,6 +293,64 @@ def report_impossible(n, first, max_stars):
             print(f"  accepted: {kind}, {case['about']}: {result.to_dict()}")
     print(
         f"impossible: {n} cases, {n - accepted} refused; "
+        f"{np.mean(seconds):.2f} s each (processor), longest {np.max(seconds):.1f}"
+    )
+
+
+def spoil_few(seed):
+    """Few-star frame of `few_stars.py` whose sources have nothing to do with its catalogue."""
+    from few_stars import LAYOUTS, Field
+
+    rng = np.random.default_rng([seed, 2])
+    # a fifth as many are spurious: 15 to 40 sources
+    stars = int(rng.integers(13, 34))
+    layout = "all" if rng.uniform() < 0.5 else str(rng.choice(LAYOUTS))
+    field = Field(seed, stars, layout, errors=rng.uniform() < 0.7)
+    kind = ("new places", "mirror", "half a turn", "clumps")[seed // 16 % 4]
+    sources, catalog = field.sources, field.catalog
+    size = np.array(field.shape[::-1]) - 1
+    x, y = np.array(sources["x"]), np.array(sources["y"])
+    if kind == "new places":
+        x, y = field._draw_places(rng, len(x))
+    elif kind == "mirror":
+        x = size[0] - x
+    elif kind == "half a turn":
+        x, y = size[0] - x, size[1] - y
+    else:
+        # half of either list in the same three clumps, as of clusters, star by star elsewhere
+        centers, width = rng.uniform(0.2, 0.8, (3, 2)) * size, 0.05 * size.min()
+        for of_catalog in (False, True):
+            n = len(catalog if of_catalog else sources)
+            clump = rng.uniform(size=n) < 0.5
+            place = centers[rng.integers(3, size=n)] + width * rng.normal(size=(n, 2))
+            place = np.clip(place, 0, size)[clump]
+            if of_catalog:
+                catalog["ra"][clump], catalog["dec"][clump] = field.sky(*place.T)
+            else:
+                x, y = field._draw_places(rng, n)
+                x[clump], y[clump] = place.T
+    sources["x"], sources["y"] = x, y
+    if rng.uniform() < 0.2:
+        del catalog["phot_g_mean_mag"]
+    about = f"seed {seed} {kind}, {stars} stars, {layout}, {field.kind.__name__} {field.shape}"
+    return field, sources, catalog, about
+
+
+def report_few_impossible(n, first):
+    accepted, seconds = 0, []
+    for seed in range(first, first + n):
+        field, sources, catalog, about = spoil_few(seed)
+        began = time.process_time()
+        try:
+            _, found = match_sources(sources, catalog, field.header, image_shape=field.shape)
+        except MatchError:
+            continue
+        finally:
+            seconds.append(time.process_time() - began)
+        accepted += 1
+        print(f"  accepted: {about}: {found.to_dict()}")
+    print(
+        f"few-impossible: {n} cases, {n - accepted} refused; "
         f"{np.mean(seconds):.2f} s each (processor), longest {np.max(seconds):.1f}"
     )
 
@@ -639,7 +698,10 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parts = ("lab", "random", "hard", "impossible", "blind", "refusals", "times", "real")
+    parts = (
+        "lab", "random", "hard", "impossible", "few-impossible", "blind", "refusals", "times",
+        "real",
+    )  # fmt: skip
     parser.add_argument("part", nargs="*", help=", ".join(parts))
     parser.add_argument("--cases", nargs="+", default=LAB_CASES)
     parser.add_argument("--seeds", nargs="+", type=int, default=[1])
@@ -662,6 +724,8 @@ def main():
             report_refusals(max(3, a.n // 10))
         elif part == "hard":
             report_random(a.n, a.first, None, make=make_hard_case, name="hard")
+        elif part == "few-impossible":
+            report_few_impossible(a.n, a.first)
         elif part == "real":
             report_real()
         else:

@@ -41,8 +41,9 @@ The stages, in plain words:
    is what chance gives.  The pairs, less one for each term of the polynomial, must exceed it by a
    stated significance in the frame, and in every part of the frame with enough stars (overlapping
    circles that hold some 16 pairs each), where they must not be far fewer than the better parts of
-   the frame promise either.  If a group fails, the next is tried; if all fail,
-   `~wpdc_gwcs.exceptions.MatchError` says what was missing.
+   the frame promise either.  Of a short list the mappings that the search could have found are
+   counted instead, and the order of brightness with them.  If a group fails, the next is tried;
+   if all fail, `~wpdc_gwcs.exceptions.MatchError` says what was missing.
 
 Where the place of a frame is known to within a few star distances (from the other detectors of a
 camera), `match_nearby` needs no patterns and is content with as few stars as can prove anything.

@@ -6,7 +6,7 @@ import numpy as np
 
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
-from wpdc_gwcs.matching._mapping import MAX_ORDER, SmoothMap
+from wpdc_gwcs.matching._mapping import MAX_ORDER, SmoothMap, turn_and_scale
 from wpdc_gwcs.matching._search import MIN_STARS, Limits, Search, Stars
 from wpdc_gwcs.threads import one_blas_thread
 
@@ -78,7 +78,8 @@ def match_planes(
     max_order : int
         Highest order of the smooth mapping.
     min_significance : float
-        Significance over chance that the pairs must have, sigma.
+        Significance over chance that the pairs must have, sigma; 0.7 of it do where stars are so
+        few that all mappings the search could have found are counted.
     min_purity : float
         Least share of right pairs.
 
@@ -139,6 +140,7 @@ def match_planes(
     shift, matrix = mapping.linear_part()
     if found.parity < 0:
         matrix = matrix @ np.diag([-1, 1])
+    rotation, scale = turn_and_scale(matrix, search.shape)
     return (
         *_in_source_order(search.source_rows[i], search.reference_rows[j]),
         MatchDiagnostics(
@@ -155,13 +157,12 @@ def match_planes(
             radius=float(np.median(found.radius)),
             mapping=mapping,
             shift=(float(shift[0]), float(shift[1])),
-            rotation=float(
-                np.rad2deg(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
-            ),
-            scale=float(np.sqrt(abs(np.linalg.det(matrix)))),
+            rotation=rotation,
+            scale=scale,
             parity=found.parity,
             areas=evidence.areas,
             timings=clock.laps,
+            search_significance=evidence.search_significance,
         ),
     )
 

@@ -45,6 +45,9 @@ class MatchDiagnostics:
         Evidence in the parts of the frame.
     timings : dict
         Seconds spent in each stage.
+    search_significance : float
+        The same with all mappings counted that the search could have found instead, for which less
+        is needed; NaN where there are too many stars for that to matter.
     """
 
     n_sources: int
@@ -65,6 +68,7 @@ class MatchDiagnostics:
     parity: int
     areas: tuple
     timings: dict = field(default_factory=dict)
+    search_significance: float = float("nan")
 
     def to_dict(self):
         """Return the plain numbers (no mapping, areas summed up) for tables and files."""

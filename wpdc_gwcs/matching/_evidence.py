@@ -9,7 +9,14 @@ from scipy.special import gammaln, pdtr
 from wpdc_gwcs.matching._mapping import count_terms
 from wpdc_gwcs.matching._pairs import find_edges, one_to_one
 
-__all__ = ["AreaEvidence", "Evidence", "collect_evidence", "poisson_significance"]
+__all__ = [
+    "AreaEvidence",
+    "Evidence",
+    "collect_evidence",
+    "judge_few",
+    "log_chance_of_order",
+    "poisson_significance",
+]
 
 # Sources looked at for the chance level, and shifts tried.
 _SAMPLE = 10_000
@@ -20,6 +27,24 @@ _JUDGED = 8.0
 _MOST_AREAS = 16
 # Stars counted in circles: more would not sharpen the verdict.
 _COUNTED = 60_000
+# Share of the significance that is needed where all that the search could choose from is counted:
+# 9 sigma (3e-18) leave nine orders of magnitude for the hypotheses of a search, 6.3 sigma (2e-9)
+# are what is left, one wrong match in a hundred million frames that have none.
+_SEARCH_SHARE = 0.7
+# Ways to read the axes of the frame that a blind search tries.
+_ORIENTATIONS = 8
+# Leave-one-out residuals of pairs on which the mapping hangs are not looked at more closely, nor
+# shares of the radius at which positions are not independent.
+_MOST_LEVERAGE = 0.99
+_LEAST_SHARE = 1e-3
+# Parts of the sources, those with the smallest radii, of which the one that says most is taken.
+_WIDEST = (0.5, 0.7, 0.85, 1.0)
+# Neighbor that tells the local density of reference stars.
+_DENSITY_NEIGHBOR = 6
+# Reference stars within reach of a source at least: none found does not mean that none could be.
+_LEAST_REACHED = 0.5
+# Pairs without which the order of their brightness is not looked at, and the most that are.
+_ORDER_PAIRS = (5, 100)
 
 
 @dataclass(frozen=True)
@@ -57,7 +82,10 @@ class AreaEvidence:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Numbers on which a match is accepted or refused."""
+    """Numbers on which a match is accepted or refused.
+
+    `search_significance` is that of `judge_few`, NaN where there are many stars.
+    """
 
     n_pairs: int
     n_sources: int
@@ -67,14 +95,28 @@ class Evidence:
     completeness: float
     significance: float
     areas: tuple
+    search_significance: float = np.nan
+
+    def is_significant(self, min_significance):
+        """Whether the pairs are beyond chance, by the count or by what the search could choose."""
+        return (
+            self.significance >= min_significance
+            or self.search_significance >= _SEARCH_SHARE * min_significance
+        )
 
     def missing(self, *, min_significance, min_purity):
         """Say what is missing for the match to be accepted; an empty string if nothing is."""
-        if self.significance < min_significance:
+        if not self.is_significant(min_significance):
+            searched = ""
+            if np.isfinite(self.search_significance):
+                searched = (
+                    f" (or {_SEARCH_SHARE * min_significance:.1f} with all mappings of so few "
+                    f"stars counted: {self.search_significance:.1f})"
+                )
             return (
                 f"{self.n_pairs} pairs with {self.expected_by_chance:.3g} expected by chance "
                 f"have a significance of {self.significance:.1f} sigma, "
-                f"{min_significance:g} are needed"
+                f"{min_significance:g} are needed{searched}"
             )
         if self.purity < min_purity:
             return (
@@ -103,10 +145,158 @@ def poisson_significance(count, expected):
     """
     if count <= expected:
         return 0.0
-    log_p = (
+    return float(np.sqrt(max(0.0, -2 * _log_poisson_tail(count, expected))))
+
+
+def _log_poisson_tail(count, expected):
+    """Upper bound of ln P(at least `count`), for counts above the mean."""
+    return (
         count * np.log(expected) - expected - gammaln(count + 1) - np.log1p(-expected / (count + 1))
     )
-    return float(np.sqrt(max(0.0, -2 * log_p)))
+
+
+def judge_few(
+    points, mapped, radius, leverage, stars, terms, pairs, shape, *, reaches, brightness=None
+):
+    r"""Significance of the pairs of a short list against all mappings that could have been found.
+
+    With a few stars the chance level cannot be counted: at no shift there is a pair, and whether
+    one in ten shifts or in a thousand is to be expected makes all the difference.  Here it follows
+    from the density of reference stars, and what the search could choose from is counted instead.
+
+    Parameters
+    ----------
+    points, mapped : (N, 2) ndarray
+        Starting and mapped positions of the sources, px.
+    radius : (N,) ndarray
+        Pairing radius of each source, px.
+    leverage : (N,) ndarray
+        Variance of the mapping in units of the variance of one pair.
+    stars : Stars
+        The reference stars.
+    terms : int
+        Terms of the mapping per axis.
+    pairs : (i_src, i_ref)
+        The pairs.
+    shape : (int, int)
+        Shape of the frame.
+    reaches : (float, float, float)
+        Largest displacement that is searched: of a source, of a source against another one, and
+        what is left of it without the linear part, px.
+    brightness : (ndarray, ndarray), optional
+        Brightness of the sources and of the reference stars, in any units that rise with it.
+
+    Returns
+    -------
+    float
+        As `poisson_significance`.
+
+    Notes
+    -----
+    A mapping of T terms per axis can be laid through any T pairs, and what other pairs it makes is
+    evidence.  Of N sources there are :math:`\binom N T` sets, and each source of a set may be one
+    of the :math:`m_k` stars in its reach.  So the expected number of mappings that have n pairs by
+    chance is at most
+
+    .. math::
+        \binom N T \prod_{k=1}^T m_k \; P(\ge n - T \mid \lambda)
+
+    where the fourth and later stars of a set can be no further from where the first three put them
+    than the distortion reaches.  P is taken at the share of the pairing radii that says most, from
+    residuals of pairs predicted by the others, and for the part of the sources up to the radius
+    that says most; both choices are counted too.  Wrong pairs are in no order of brightness: the
+    chance of the order that they have (Kendall) is independent of P, and the product q of the two
+    is worth :math:`q (1 - \ln q)` (Fisher).
+    """
+    i, j = pairs
+    log_chance = _log_chance_of_places(points, mapped, radius, leverage, stars, terms, pairs, shape)
+    if log_chance == 0:
+        return 0.0
+    if brightness is not None:
+        log_chance += log_chance_of_order(brightness[0][i], brightness[1][j])
+        log_chance += np.log1p(-log_chance)
+    log_chance += _log_choices(points, mapped, stars, terms, pairs, reaches)
+    return float(np.sqrt(max(0.0, -2 * log_chance)))
+
+
+def _log_chance_of_places(points, mapped, radius, leverage, stars, terms, pairs, shape):
+    """Logarithm of the chance of the pairs of one mapping, of which some determine it."""
+    i, j = pairs
+    is_paired = np.zeros(len(points), bool)
+    is_paired[i] = True
+    expected = _expected_within(mapped, radius, is_paired, stars, shape)
+    residual = np.hypot(*(mapped[i] - stars.points[j]).T)
+    share = residual / (1 - np.minimum(leverage[i], _MOST_LEVERAGE)) / radius[i]
+    log_chance = 0.0
+    # where the mapping is ill known radii are so wide that they say nothing, and hide the rest
+    for widest in np.quantile(radius, _WIDEST):
+        # the k-th is the share of the radii within which there are k pairs, at most all
+        shares = np.minimum(np.sort(share[radius[i] <= widest]), 1.0)[terms:]
+        count = np.arange(1, len(shares) + 1)
+        level = expected[radius <= widest].sum() * np.maximum(shares, _LEAST_SHARE) ** 2
+        rare = count > level
+        tail = _log_poisson_tail(count[rare], level[rare])
+        log_chance = min(log_chance, np.min(tail, initial=0.0))
+    return float(log_chance)
+
+
+def _log_choices(points, mapped, stars, terms, pairs, reaches):
+    """Logarithm of the number of mappings that the pairs were chosen from."""
+    i, j = pairs
+    n, n_sources = len(i), len(points)
+    is_paired = np.zeros(n_sources, bool)
+    is_paired[i] = True
+    moved = stars.points[j] - points[i]
+    against = moved - moved.mean(axis=0)
+    place = points[i] - points[i].mean(axis=0)
+    bent = against - place @ np.linalg.lstsq(place, against, rcond=None)[0]
+    # a mapping that reaches further than the limits could have been laid through more pairs
+    sizes = [
+        max(reach, float(np.hypot(*offset.T).max()))
+        for reach, offset in zip(reaches, (moved, against, bent), strict=True)
+    ]
+    choices = np.log(n * len(_WIDEST) * _ORIENTATIONS)
+    choices += gammaln(n_sources + 1) - gammaln(terms + 1) - gammaln(n_sources - terms + 1)
+    for size, times in zip(sizes, (1, 2, terms - 3), strict=True):
+        within = stars.tree.query_ball_point(mapped, size, return_length=True) - is_paired
+        choices += times * np.log(max(float(within.mean()), _LEAST_REACHED))
+    return float(choices)
+
+
+def _expected_within(mapped, radius, is_paired, stars, shape):
+    """Say how many reference stars chance puts within the radius of each source.
+
+    From the distance to one of the nearest stars, in pixels and in units of the sides of the
+    frame: on a narrow frame a circle that holds enough stars is mostly outside of it.
+    """
+    k = min(_DENSITY_NEIGHBOR, stars.tree.n)
+    sides = np.array(shape[::-1], float)
+    sides /= np.sqrt(sides.prod())
+    squares = [
+        cKDTree(stars.points / units).query(mapped / units, k=[k])[0][:, 0] ** 2
+        for units in (np.ones(2), sides)
+    ]
+    return (k - is_paired) * radius**2 / np.maximum(np.minimum(*squares), radius**2)
+
+
+def log_chance_of_order(one, other):
+    """Logarithm of the chance that two lists without relation are in as similar an order.
+
+    From the number of inversions (Kendall's tau), exactly.
+    """
+    fewest, most = _ORDER_PAIRS
+    known = np.isfinite(one) & np.isfinite(other)
+    one, other = one[known][:most], other[known][:most]
+    if len(one) < fewest:
+        return 0.0
+    n_inversions = np.count_nonzero(
+        np.subtract.outer(one, one) * np.subtract.outer(other, other) < 0
+    )
+    # the k-th value may stand before 0 to k - 1 of the others, each equally likely
+    chance = np.ones(1)
+    for k in range(2, len(one) + 1):
+        chance = np.convolve(chance, np.full(k, 1.0 / k))
+    return float(np.log(max(chance[: n_inversions // 2 + 1].sum(), 1e-300)))
 
 
 def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shape, *, slack=1.0):

@@ -5,12 +5,26 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-__all__ = ["SmoothMap", "SmoothFit", "count_terms", "fit_smooth_map", "scatter_of"]
+__all__ = [
+    "SmoothFit",
+    "SmoothMap",
+    "count_terms",
+    "find_narrow_axis",
+    "fit_smooth_map",
+    "scatter_of",
+    "turn_and_scale",
+]
 
 MAX_ORDER = 7
 # Pairs that a fit of n terms needs at least: fewer, and leave-one-out errors no longer mean
 # anything.
 PAIRS_PER_TERM = 2.0
+# On a frame as narrow as this (short side by long side) the second and higher powers of the short
+# direction are worth less than a pixel where a distortion is 250 px: 250 * 0.05**2 = 0.6.  As long
+# as there are pairs for no more than this order, they take no part, to the gain of higher powers
+# of the long one.
+_NARROW = 0.05
+_NARROW_ORDER = 3
 # Below this scatter (px) differences are round-off: it keeps noise-free input from ending in a
 # zero radius.
 SMALLEST_SCATTER = 1e-5
@@ -20,6 +34,44 @@ _BLOCK = 65536
 def count_terms(order):
     """Count the terms per axis of a full two-dimensional polynomial."""
     return (order + 1) * (order + 2) // 2
+
+
+def _columns(order, narrow):
+    """Columns of the design that take part, and their degrees; `narrow` is the axis or None."""
+    powers = np.array([(n - q, q) for n in range(order + 1) for q in range(n + 1)])
+    use = np.ones(len(powers), bool) if narrow is None else powers[:, narrow] <= 1
+    return np.flatnonzero(use), powers.sum(axis=1)[use]
+
+
+def find_narrow_axis(image_shape):
+    """0 or 1 where the frame is very narrow in x or y, else None."""
+    ny, nx = image_shape
+    return 0 if nx < _NARROW * ny else 1 if ny < _NARROW * nx else None
+
+
+def turn_and_scale(matrix, image_shape):
+    """Rotation and scale of the similarity that comes closest to a matrix on a frame.
+
+    The directions of the sides count as the sides are long: across a narrow frame there is nothing
+    to tell a rotation from.
+
+    Parameters
+    ----------
+    matrix : (2, 2) ndarray
+        First derivatives of a mapping.
+    image_shape : (int, int)
+        Shape of the frame, ``(ny, nx)``.
+
+    Returns
+    -------
+    rotation, scale : float
+        Rotation in deg and scale.
+    """
+    ny, nx = image_shape
+    of_x, of_y = np.array([nx**2, ny**2]) / (nx**2 + ny**2)
+    cosine = of_x * matrix[0, 0] + of_y * matrix[1, 1]
+    sine = of_x * matrix[1, 0] - of_y * matrix[0, 1]
+    return float(np.rad2deg(np.arctan2(sine, cosine))), float(np.hypot(sine, cosine))
 
 
 def scatter_of(dx, dy):
@@ -174,12 +226,20 @@ class SmoothFit:
         Pairs that took part after clipping.
     triangle : (n_terms, n_terms) ndarray
         Triangular factor of the design matrix.
+    columns : (n_terms,) ndarray of int
+        Terms of the mapping that were fitted; the others are zero.
     """
 
     mapping: SmoothMap
     scatter: float
     used: np.ndarray
     triangle: np.ndarray
+    columns: np.ndarray
+
+    @property
+    def n_terms(self):
+        """Terms per axis that were fitted."""
+        return len(self.columns)
 
     def leverage(self, x, y):
         """Variance of the prediction at a position in units of the variance of one pair."""
@@ -188,13 +248,16 @@ class SmoothFit:
         for start in range(0, len(x), _BLOCK):
             part = slice(start, start + _BLOCK)
             design = _design(*self.mapping._normalise(x[part], y[part]), self.mapping.order)
+            design = design[:, self.columns]
             out[part] = (
                 solve_triangular(self.triangle, design.T, trans="T", check_finite=False) ** 2
             ).sum(axis=0)
         return out
 
 
-def fit_smooth_map(x, y, x_ref, y_ref, *, center, scale, max_order=MAX_ORDER, clip=5.0):
+def fit_smooth_map(
+    x, y, x_ref, y_ref, *, center, scale, max_order=MAX_ORDER, clip=5.0, narrow=None
+):
     """Fit a smooth mapping to pairs: order from leave-one-out errors, outliers clipped.
 
     All orders come from one QR decomposition, since the columns are sorted by degree.  The order
@@ -215,6 +278,8 @@ def fit_smooth_map(x, y, x_ref, y_ref, *, center, scale, max_order=MAX_ORDER, cl
         Highest order to try.
     clip : float
         Pairs further off than this many robust standard deviations take no part.
+    narrow : int, optional
+        Axis in which the frame is narrow, see `find_narrow_axis`.
 
     Returns
     -------
@@ -227,43 +292,48 @@ def fit_smooth_map(x, y, x_ref, y_ref, *, center, scale, max_order=MAX_ORDER, cl
     fit = None
     for _ in range(8):
         count = np.count_nonzero(used)
+        few = count < PAIRS_PER_TERM * count_terms(_NARROW_ORDER + 1)
+        columns, degrees = _columns(max_order, narrow if few else None)
+        size = np.searchsorted(degrees, np.arange(max_order + 1), side="right")
         top = 0
-        while top < max_order and count >= PAIRS_PER_TERM * count_terms(top + 1):
+        while top < max_order and count >= PAIRS_PER_TERM * size[top + 1]:
             top += 1
         if top == 0:
             return fit
-        design = _design(u, v, top)
+        design = _design(u, v, top)[:, columns[: size[top]]]
         q, r = np.linalg.qr(design[used])
         diagonal = np.abs(np.diag(r))
         if diagonal[:3].min() < 1e-4 * diagonal[0]:
             return fit
-        while diagonal[: count_terms(top)].min() < 1e-9 * diagonal[0]:
+        while diagonal[: size[top]].min() < 1e-9 * diagonal[0]:
             top -= 1
         projected = q.T @ target[used]
         residual = target[used].copy()
         leverage = np.zeros(count)
         errors = []
         for order in range(1, top + 1):
-            columns = slice(count_terms(order - 1) if order > 1 else 0, count_terms(order))
-            residual = residual - q[:, columns] @ projected[columns]
-            leverage = leverage + (q[:, columns] ** 2).sum(axis=1)
+            of_order = slice(size[order - 1] if order > 1 else 0, size[order])
+            residual = residual - q[:, of_order] @ projected[of_order]
+            leverage = leverage + (q[:, of_order] ** 2).sum(axis=1)
             errors.append(((residual / (1 - np.minimum(leverage, 0.99))[:, None]) ** 2).sum(axis=1))
         errors = np.array(errors)
         variances = np.maximum(np.median(errors, axis=1) / (2 * np.log(2)), SMALLEST_SCATTER**2)
         score = np.minimum(errors, clip**2 * variances.min()).mean(axis=1)
         order = 1 + int(np.flatnonzero(score <= 1.02 * score.min() + SMALLEST_SCATTER**2)[0])
-        terms = count_terms(order)
-        coefficients = solve_triangular(r[:terms, :terms], projected[:terms])
+        terms = size[order]
+        columns = columns[:terms]
+        fitted = solve_triangular(r[:terms, :terms], projected[:terms])
+        coefficients = np.zeros((2, count_terms(order)))
+        coefficients[:, columns] = fitted.T
         scatter = float(np.sqrt(variances[order - 1]))
-        squared = ((target - design[:, :terms] @ coefficients) ** 2).sum(axis=1)
+        squared = ((target - design[:, :terms] @ fitted) ** 2).sum(axis=1)
         squared[used] = errors[order - 1]
         fit = SmoothFit(
-            SmoothMap(
-                order, np.ascontiguousarray(coefficients.T), np.asarray(center, float), float(scale)
-            ),
+            SmoothMap(order, coefficients, np.asarray(center, float), float(scale)),
             scatter,
             used,
             r[:terms, :terms],
+            columns,
         )
         now = squared <= (clip * scatter) ** 2
         if (now == used).all():

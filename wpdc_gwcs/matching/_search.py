@@ -1,13 +1,13 @@
 """The search: starts from patterns or a given mapping, growth to the whole frame, verdict."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from wpdc_gwcs.exceptions import MatchError
-from wpdc_gwcs.matching._evidence import Evidence, collect_evidence
+from wpdc_gwcs.matching._evidence import Evidence, collect_evidence, judge_few
 from wpdc_gwcs.matching._features import (
     MAX_NEIGHBOURS,
     N_NEIGHBOURS,
@@ -17,7 +17,13 @@ from wpdc_gwcs.matching._features import (
     select_coherent,
 )
 from wpdc_gwcs.matching._local import LocalCorrection
-from wpdc_gwcs.matching._mapping import SmoothMap, fit_smooth_map, scatter_of
+from wpdc_gwcs.matching._mapping import (
+    SmoothMap,
+    find_narrow_axis,
+    fit_smooth_map,
+    scatter_of,
+    turn_and_scale,
+)
 from wpdc_gwcs.matching._pairs import find_edges, find_nearest, one_to_one
 from wpdc_gwcs.matching._rivals import find_rival_offset
 
@@ -25,6 +31,10 @@ __all__ = ["Limits", "Match", "Search", "Stars", "first_pairs"]
 
 # Fewer stars than this in either list cannot give evidence whatever they do.
 MIN_STARS = 8
+
+# Where either list has no more stars than this on the frame, the few are judged by `judge_few` too:
+# with more, right matches have enough pairs for the chance level to be counted.
+_FEW = 100
 
 # Sources of the bright subsets that are tried in turn; then all.
 _LEVELS = (500, 2000)
@@ -68,6 +78,8 @@ _SLACK = 2.5
 # Radius that may be used where stars are so sparse that 0.3 % are expected by chance within it.
 _WIDE_RADIUS = 20.0
 _HARMLESS = np.sqrt(0.003 / _MAX_CROWDING)
+# No header is right up to a rotation and yet so far off in the area of a pixel: that is a mirror.
+_MOST_STRETCH = 2.0
 # Clipping once the pairs are nearly pure, in units of the scatter.
 _LOOSE_CLIP = 50.0
 
@@ -229,7 +241,7 @@ class Search:
                     if self.n_partial >= _MOST_PARTIAL and best is None:
                         raise self.refusal(hint=False)
                     continue
-                error = self.header_error(found.turned_mapping)
+                error = self.header_error(found)
                 if error is not None:
                     beyond = beyond or error
                 elif best is None:
@@ -471,11 +483,29 @@ class Search:
         evidence = collect_evidence(
             points, mapped, radius, self.stars, fit.mapping, pairs, self.shape
         )
+        if min(evidence.n_sources, evidence.n_reference) <= _FEW:
+            limits = self.limits
+            reach = limits.reach(limits.half_diagonal)
+            judged = judge_few(
+                points,
+                mapped,
+                radius,
+                leverage,
+                self.stars,
+                fit.n_terms,
+                pairs,
+                self.shape,
+                reaches=(reach, reach - limits.max_shift, limits.max_distortion),
+                brightness=None
+                if self.flux is None or self.brightness is None
+                else (self.flux, self.brightness),
+            )
+            evidence = replace(evidence, search_significance=judged)
         clock.lap("evidence")
         if evidence.missing(**self.rules):
             self.note_failure(evidence)
             # right as a whole but for a part of the frame: other starts seldom help
-            self.n_partial += evidence.significance >= self.rules["min_significance"]
+            self.n_partial += evidence.is_significant(self.rules["min_significance"])
             return None
         return Match(turn, fit.mapping, mapped, radius, pairs, n_ambiguous, scatter, evidence)
 
@@ -487,6 +517,7 @@ class Search:
             center=self.frame.center,
             scale=self.frame.scale,
             max_order=max_order or self.max_order,
+            narrow=find_narrow_axis(self.shape),
             **options,
         )
 
@@ -550,7 +581,7 @@ class Search:
             if len(pairs[0]) < MIN_STARS:
                 return match
             rival = self.finish(match.turn, pairs, clock)
-            if rival is None or self.header_error(rival.turned_mapping) is not None:
+            if rival is None or self.header_error(rival) is not None:
                 return match
             better = self.prefer(match, rival)
             if better is match:
@@ -563,19 +594,34 @@ class Search:
 
     # refusals
 
-    def header_error(self, mapping):
-        """Build the error that names what is further from the header than allowed, or None."""
-        shift, matrix = mapping.linear_part()
-        shift = float(np.hypot(*shift))
-        rotation = float(
-            np.rad2deg(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
+    def header_error(self, match):
+        """Build the error that names what is further from the header than allowed, or None.
+
+        Rotation and scale are those at the center of the frame, or those of the pairs as a whole
+        where these are closer to the header: with few pairs in a part of the frame only, the
+        mapping means nothing at the center.
+        """
+        shift, at_center = match.turned_mapping.linear_part()
+        rows = match.pairs[0]
+        place, mapped = self.turned(match.turn)[rows], match.mapped[rows]
+        of_pairs = np.linalg.lstsq(place - place.mean(axis=0), mapped - mapped.mean(axis=0), None)[
+            0
+        ].T
+        area = float(np.linalg.det(of_pairs))
+        if not 1 / _MOST_STRETCH < area < _MOST_STRETCH:
+            # on a narrow frame a mirror is within reach of the other limits
+            return MatchError(
+                f"the starting WCS is mirrored or stretched: the pairs change the area of the "
+                f"frame by a factor of {area:.3g}; {_HINT}"
+            )
+        turned, scaled = zip(
+            *(turn_and_scale(matrix, self.shape) for matrix in (at_center, of_pairs)), strict=True
         )
-        scale = float(np.sqrt(abs(np.linalg.det(matrix))))
         limits = self.limits
         for what, value, most, unit in (
-            ("pointing", shift, limits.max_shift, "px"),
-            ("rotation", abs(rotation), limits.max_rotation, "deg"),
-            ("scale", 100 * abs(scale - 1), 100 * limits.max_scale, "%"),
+            ("pointing", float(np.hypot(*shift)), limits.max_shift, "px"),
+            ("rotation", min(np.abs(turned)), limits.max_rotation, "deg"),
+            ("scale", 100 * min(np.abs(np.subtract(scaled, 1))), 100 * limits.max_scale, "%"),
         ):
             if value > most:
                 return MatchError(
