@@ -143,9 +143,17 @@ class Field:
         self.tan = tan_wcs(crpix, crval, cd)
         place = np.ravel(self.tan.wcs_pix2world(*self.center, 0))
         # The header's error is that of the center, also where its reference point is far off.
-        wrong = turn(rng.normal(0, 0.1)) @ cd * (1 + rng.normal(0, 0.002))
-        off = rng.normal(0, 3, 2) / 3600 @ np.linalg.inv(cd).T
+        here = self._local_cd(place)
+        wrong = turn(rng.normal(0, 0.1)) @ here * (1 + rng.normal(0, 0.002))
+        off = rng.normal(0, 3, 2) / 3600 @ np.linalg.inv(here).T
         self.header = tan_wcs(self.center + off, place, wrong)
+
+    def _local_cd(self, place):
+        """CD matrix of the center on its own tangent plane: near a pole north turns quickly."""
+        plane = tan_wcs([0.0, 0.0], place, np.eye(2))
+        step = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+        at = plane.wcs_world2pix(self.tan.wcs_pix2world(self.center + step, 0), 0)
+        return 0.5 * np.column_stack([at[0] - at[1], at[2] - at[3]])
 
     def _draw_part(self, rng, layout):
         low, axis, side = rng.uniform(-0.8, 0.2), rng.integers(2), rng.choice([-1, 1], 2)

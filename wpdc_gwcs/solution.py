@@ -89,6 +89,17 @@ class DistortionSolution:
         """
         return self.wcs.get_transform("detector", "undistorted")(x, y)
 
+    @cached_property
+    def area_range(self):
+        """Smallest and largest area of a pixel over the detector, relative to the median."""
+        ny, nx = self.image_shape
+        x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, 33), np.linspace(-0.5, ny - 0.5, 33))
+        ux, uy = self.undistort(x, y)
+        area = np.gradient(ux, axis=1) * np.gradient(uy, axis=0)
+        area -= np.gradient(ux, axis=0) * np.gradient(uy, axis=1)
+        area /= np.median(area)
+        return float(area.min()), float(area.max())
+
     def covariance(self, x, y):
         """Covariance of the distortion that the instrument predicts, apart from its linear part.
 

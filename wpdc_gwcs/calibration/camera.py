@@ -10,6 +10,7 @@ from astropy.table import QTable
 
 from wpdc_gwcs.calibration.checks import check_solution, shortcomings
 from wpdc_gwcs.calibration.matched import optional_column
+from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import (
     LinearWCS,
     detector_center,
@@ -125,7 +126,7 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
                 [_exposure(f, p, attitudes[f.name], holdout) for f, p in zip(group, pairs)],
                 image_shape=shapes,
                 crpix=crpix,
-                weight={name: settings.radial_weight(shape) for name, shape in shapes.items()},
+                weight=_weights(settings, shapes),
                 degree=settings.degree,
                 n_grid=settings.n_grid,
                 lut=settings.lut,
@@ -187,6 +188,13 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
     _add_scatter(result.solutions, calibrations, [] if update else solution)
     solved = {c.solution.detector for c in calibrations}
     return {n: s for n, s in result.solutions.items() if n in solved}, calibrations, failures
+
+
+def _weights(settings, shapes):
+    """Radial weight of each detector; none where no table mends what the default leaves out."""
+    if settings.lut == "none" and settings.weight == Settings.weight:
+        return None
+    return {name: settings.radial_weight(shape) for name, shape in shapes.items()}
 
 
 def _of_one_shape(group, failures):

@@ -149,7 +149,7 @@ def shortcomings(frame, calibration, *, held, known=False):
         )
     if frame.epoch is None and "pmra" in frame.reference.colnames:
         reasons.append("the frame has no epoch: the stars' motions could not be applied")
-    low, high = _area_range(calibration, nx, ny)
+    low, high = calibration.solution.area_range
     if not (low >= _MIN_AREA and high <= _MAX_AREA):
         reasons.append(f"the map stretches the detector by {low:.2f} to {high:.2f} in area")
     offset = _offset_of_parts(matches, used, frame.image_shape, calibration.statistics)
@@ -207,16 +207,6 @@ def largest_hole(x, y, image_shape):
     # Circles that reach over the rim would be as large for stars all over the detector.
     rim = np.min([u, 1 - u, v, 1 - v], axis=0)
     return float(np.pi * np.max(np.minimum(distance, rim)) ** 2)
-
-
-def _area_range(calibration, nx, ny):
-    """Smallest and largest area of a pixel over the detector, relative to the middle value."""
-    x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, 33), np.linspace(-0.5, ny - 0.5, 33))
-    ux, uy = calibration.undistort(x, y)
-    area = np.gradient(ux, axis=1) * np.gradient(uy, axis=0)
-    area -= np.gradient(ux, axis=0) * np.gradient(uy, axis=1)
-    area /= np.median(area)
-    return float(area.min()), float(area.max())
 
 
 def _offset_of_parts(matches, used, image_shape, statistics):

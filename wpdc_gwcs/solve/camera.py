@@ -226,7 +226,7 @@ def solve(
             state = with_fields(o, state)
             state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE)
             # What was scatter before is field now: the errors are smaller than they seemed.
-            state = with_fields(o, with_error_models(o, state))
+            state = with_error_models(o, state)
             if mosaic and lut != "none":
                 state = with_statics(o, state)
             if lut != "none" and not stored and not alone:
@@ -454,7 +454,7 @@ def _updated(o, state, stored, group, n_grid):
         )
         stored[detector.name] = solution
         tables.append(StoredMap(solution))
-    return replace(state, model=replace(state.model, tables=tuple(tables))), stored, infos
+    return replace(state, model=state.model.changed(tables=tuple(tables))), stored, infos
 
 
 def _result(o, state, stored, infos, group, settings, cd, update):
@@ -485,13 +485,17 @@ def _result(o, state, stored, infos, group, settings, cd, update):
             settings={**settings, "weight": weight.name, "r0": float(weight.r0)},
         )
     residual = all_residuals(o, state)
-    fits = []
+    fits, places = [], {}
     for f in range(len(o.frames)):
         parts = {}
         if state.reason[f] is None:
             solution = solutions[o.detector(f).name]
             tabled = lut != "none" or refine == "field"
-            parts = represent_frame(o, state, f, solution, n_grid=n_grid if tabled else 0)
+            parts = represent_frame(
+                o, state, f, solution, n_grid=n_grid if tabled else 0,
+                table_sigma=_table_sigma(stored.get(solution.detector), infos[o.detector_of[f]]),
+                places=places,
+            )  # fmt: skip
             if not tabled:
                 residual[:, o.slices[f]] = delivered_residual(o, f, solution, parts)
             if refine == "pv":
@@ -503,6 +507,13 @@ def _result(o, state, stored, infos, group, settings, cd, update):
     named = {d.name: i for d, i in zip(o.detectors, infos) if i is not None}
     color = float(o.reference_color) if np.isfinite(o.reference_color) else None
     return SolveResult(solutions, tuple(fits), rejected, named, color)
+
+
+def _table_sigma(stored, info):
+    """Uncertainty of what stands beside the shared terms: a smoothed table, a stored solution."""
+    if info is not None:
+        return info.sigma
+    return None if stored is None else stored.table_sigma
 
 
 def _with_maps(o, state, group, solutions):

@@ -17,7 +17,16 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, lapack
 from scipy.optimize import minimize
 
-__all__ = ["Basis", "Field", "Products", "Spectrum", "fit_field", "learn_spectra", "patch"]
+__all__ = [
+    "Basis",
+    "Field",
+    "Products",
+    "Spectrum",
+    "fit_field",
+    "learn_spectra",
+    "patch",
+    "pooled_spectrum",
+]
 
 # The patch is this much larger than the part of the focal plane where stars are used: the waves
 # vanish at its rim.
@@ -279,7 +288,7 @@ def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
     return Products(basis, matrix, right, focal.shape[1])
 
 
-def learn_spectra(frames, make, *, start, scales, force=False, pool=_EXPOSURES_POOLED):
+def learn_spectra(frames, make, *, start, scales, force=False):
     """Find the spectrum of each exposure by evidence, about one that all exposures share.
 
     Parameters
@@ -294,8 +303,6 @@ def learn_spectra(frames, make, *, start, scales, force=False, pool=_EXPOSURES_P
         Least and largest outer scale, px.
     force : bool, optional
         Return a spectrum for every exposure, whatever the evidence.
-    pool : int, optional
-        Exposures that the common spectrum is learnt from.
 
     Returns
     -------
@@ -310,14 +317,13 @@ def learn_spectra(frames, make, *, start, scales, force=False, pool=_EXPOSURES_P
     if not frames:
         return {}
     # A few frames tell what all have in common.
-    step = -(-len(frames) // pool)
+    step = -(-len(frames) // _EXPOSURES_POOLED)
     some = [f for e in sorted(frames)[::step] for f in frames[e][:_FRAMES_POOLED]]
-    pooled = [make(f, KINDS) for f in some]
-    spectrum, gain = max(
-        (_maximize(pooled, kind, start, scales) for kind in KINDS), key=lambda found: found[1]
-    )
-    if gain < _LEAST_GAIN and not force:
+    spectrum = pooled_spectrum([make(f, KINDS) for f in some], start=start, scales=scales)
+    if spectrum is None and not force:
         return dict.fromkeys(frames)
+    if spectrum is None:
+        spectrum = Spectrum(1e-3 * start, float(np.sqrt(np.prod(scales))))
     found = {}
     for e, members in frames.items():
         group = [make(f, (spectrum.kind,)) for f in members]
@@ -325,6 +331,29 @@ def learn_spectra(frames, make, *, start, scales, force=False, pool=_EXPOSURES_P
         # a field, the amplitude is small.
         found[e], _ = _maximize(group, spectrum.kind, start, scales, about=spectrum)
     return found
+
+
+def pooled_spectrum(patches, *, start, scales):
+    """Find the spectrum that several patches have in common.
+
+    Parameters
+    ----------
+    patches : list of Products
+        Stars of each, with all kinds of field.
+    start : float
+        First guess of the amplitude, px.
+    scales : (float, float)
+        Least and largest outer scale, px.
+
+    Returns
+    -------
+    Spectrum or None
+        `None` where the stars do not speak for a field.
+    """
+    spectrum, gain = max(
+        (_maximize(patches, kind, start, scales) for kind in KINDS), key=lambda found: found[1]
+    )
+    return spectrum if gain >= _LEAST_GAIN else None
 
 
 def _maximize(group, kind, start, scales, about=None):

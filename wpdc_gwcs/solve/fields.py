@@ -4,8 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from wpdc_gwcs.solve.field import Basis, fit_field, learn_spectra, patch, products
+from wpdc_gwcs.solve.field import (
+    Basis,
+    fit_field,
+    learn_spectra,
+    patch,
+    pooled_spectrum,
+    products,
+)
 from wpdc_gwcs.solve.model import design, focal_variance, residuals
+from wpdc_gwcs.solve.surface import of_field
 
 __all__ = ["with_fields", "with_spectra", "with_statics"]
 
@@ -14,17 +22,21 @@ __all__ = ["with_fields", "with_spectra", "with_statics"]
 _MOST_MARGINAL, _MOST_FINAL = 250, 1000
 _STARS_PER_WAVE_MARGINAL, _STARS_PER_WAVE = 3, 4
 
-# Waves of what the exposures of a detector share.
-_MOST_STATIC = 400
+# Waves of what the exposures of a detector share, and stars that its spectrum is learnt from.
+_MOST_STATIC, _STARS_POOLED = 300, 10_000
 
 # Frames of an exposure that its spectrum is learnt from, those with the most stars.
 _FRAMES_PER_EXPOSURE = 6
 
+# Largest outer scale in units of the patch; of one exposure alone, whose polynomial is free, what is
+# longer than the patch is distortion.
+_LONGEST, _LONGEST_ALONE = 4.0, 1.0
+
 # In a mosaic stars of the neighbors within this share of a detector's longer side help.
 _MARGIN = 0.35
 
-# First guess of a field's amplitude in units of the stars' errors.
-_FIRST_AMPLITUDE = 1.0
+# First guess of a field's amplitude in units of the stars' errors, and of what exposures share.
+_FIRST_AMPLITUDE, _FIRST_STATIC = 1.0, 0.3
 
 
 def _box(o, state, k, margin):
@@ -80,9 +92,14 @@ def with_spectra(o, state, *, force=False):
     longest = max(2 * b.half.max() for b in bases.values())
     spectra = learn_spectra(
         frames, make, start=_FIRST_AMPLITUDE * errors, force=force,
-        scales=(min(2 * spacing, 0.5 * longest), 4 * longest),
+        scales=(min(2 * spacing, 0.5 * longest), _longest(o, state) * longest),
     )  # fmt: skip
     return replace(plain, spectra=spectra)
+
+
+def _longest(o, state):
+    alone = o.n_exposures == 1 and state.model.scoped("detector")
+    return _LONGEST_ALONE if alone else _LONGEST
 
 
 def _products(o, state, f, basis: Basis, kinds):
@@ -117,7 +134,7 @@ def with_fields(o, state):
         With fields.
     """
     fields = {}
-    plain = replace(state, model=replace(state.model, fields={}))
+    plain = replace(state, model=state.model.with_fields({}))
     for e in range(o.n_exposures):
         spectrum = state.spectra.get(e)
         frames = [f for f in o.frames_of(e) if state.reason[f] is None]
@@ -135,7 +152,7 @@ def with_fields(o, state):
                 patch(low, high, n), spectrum, focal[:, near], residual[:, near],
                 variance[:, near],
             )  # fmt: skip
-    return replace(state, model=replace(state.model, fields=fields))
+    return replace(state, model=state.model.with_fields(fields))
 
 
 def with_statics(o, state):
@@ -154,36 +171,38 @@ def with_statics(o, state):
     Returns
     -------
     State
-        Detectors whose stars do not speak for a field have none.
+        All detectors have a field of one spectrum, or none where their stars do not speak for it.
     """
-    plain = replace(state, model=replace(state.model, statics={}))
+    plain = replace(state, model=state.model.changed(statics={}))
     stars = {}
     for k in range(len(o.detectors)):
         parts = [_stars(o, plain, f) for f in state.active if o.detector_of[f] == k]
         if parts:
             stars[k] = [np.concatenate([p[i] for p in parts], axis=1) for i in range(3)]
     boxes = {k: _box(o, state, k, 0.0) for k in stars}
-    counts = {k: columns[0].shape[1] for k, columns in stars.items()}
-    typical = float(np.median(list(counts.values())))
+    typical = float(np.median([columns[0].shape[1] for columns in stars.values()]))
     n = int(np.clip(typical, 12, _MOST_STATIC))
-
-    def make(k, kinds):
-        focal, residual, variance = stars[k]
-        return products(patch(*boxes[k], n), focal, residual, 1.0 / variance,
-                        nuisance=_affine(focal), kinds=kinds)  # fmt: skip
-
     longest = max(float(np.max(high - low)) for low, high in boxes.values())
     spacing = longest / np.sqrt(max(typical, 1.0))
-    errors = np.sqrt(np.median(state.sigma[:, state.kept] ** 2))
-    spectra = learn_spectra(
-        {k: [k] for k in stars}, make, start=0.3 * errors, pool=len(stars),
+    patches = []
+    pooled = int(np.clip(_STARS_POOLED / typical, 4, len(stars)))
+    for k in list(stars)[:: -(-len(stars) // pooled)]:
+        focal, residual, variance = stars[k]
+        patches.append(
+            products(patch(*boxes[k], n), focal, residual, 1.0 / variance, nuisance=_affine(focal))
+        )
+    spectrum = pooled_spectrum(
+        patches,
+        start=_FIRST_STATIC * np.sqrt(np.median(state.sigma[:, state.kept] ** 2)),
         scales=(min(2 * spacing, 0.5 * longest), 4 * longest),
-    )  # fmt: skip
+    )
     statics = {}
-    for k, spectrum in spectra.items():
-        if spectrum is not None:
-            statics[k] = fit_field(patch(*boxes[k], n), spectrum, *stars[k])
-    return replace(state, model=replace(state.model, statics=statics))
+    if spectrum is not None:
+        statics = {
+            k: of_field(fit_field(patch(*boxes[k], n), spectrum, *stars[k]), *boxes[k])
+            for k in stars
+        }
+    return replace(state, model=state.model.changed(statics=statics))
 
 
 def _affine(focal):

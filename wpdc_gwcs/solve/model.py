@@ -1,6 +1,6 @@
 """The model of a camera as it stands: geometry, coefficients, tables, fields."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,6 +41,38 @@ class Model:
     tables: tuple
     fields: dict = field(default_factory=dict)
     statics: dict = field(default_factory=dict)
+    _without_fields: dict = field(default_factory=dict, repr=False)
+    _at_stars: dict = field(default_factory=dict, repr=False)
+
+    def changed(self, **parts):
+        """Model with other parts than its fields; what was computed with them is forgotten.
+
+        Parameters
+        ----------
+        **parts
+            New values.
+
+        Returns
+        -------
+        Model
+            With these.
+        """
+        return replace(self, _without_fields={}, _at_stars={}, **parts)
+
+    def with_fields(self, fields):
+        """Model with other fields.
+
+        Parameters
+        ----------
+        fields : dict
+            Frame to its `Field`.
+
+        Returns
+        -------
+        Model
+            With these.
+        """
+        return replace(self, fields=fields, _at_stars={})
 
     def scoped(self, *scopes):
         """Terms of some scopes.
@@ -121,8 +153,6 @@ def colored(model, exposure, b):
         Coordinates of the stars.
     """
     total = np.zeros((2, len(b.u)))
-    if not np.any(b.color):
-        return total
     for term in model.terms:
         if term.chromatic:
             c = model.coefficients[term.name]
@@ -149,18 +179,29 @@ def residuals(model, observations, frame, *, with_field=True):
     residual, focal : (2, N) ndarray
         Px of the focal plane; residuals of pairs without a position are NaN.
     """
-    o, s = observations, observations.slices[frame]
+    if frame not in model._without_fields:
+        model._without_fields[frame] = _residuals(model, observations, frame)
+    residual, focal = model._without_fields[frame]
+    if with_field and frame in model.fields:
+        if frame not in model._at_stars:
+            model._at_stars[frame] = model.fields[frame](focal)
+        residual = residual + model._at_stars[frame]
+    return residual, focal
+
+
+def _residuals(model, o, frame):
+    """Residuals and places of the pairs of one frame, without its field."""
+    s = o.slices[frame]
     k, e = o.detector_of[frame], o.exposure_of[frame]
     detector = o.detectors[k]
     # Pairs off the detector get no residual; they must not make NaN of others on the way.
     finite = o.finite[s]
-    x, y = (np.where(finite, a[s], c) for a, c in ((o.x, detector.center[0]),
-                                                   (o.y, detector.center[1])))  # fmt: skip
-    b, _ = block(model, k, detector, x, y, o.color[s])
+    x = np.where(finite, o.x[s], detector.center[0])
+    y = np.where(finite, o.y[s], detector.center[1])
     focal = undistorted(model, k, detector, x, y)
-    total = focal + colored(model, e, b)
-    if with_field and frame in model.fields:
-        total = total + model.fields[frame](focal)
+    total = focal
+    if np.any(o.color[s]):
+        total = focal + colored(model, e, block(model, k, detector, x, y, o.color[s])[0])
     reference = model.geometry.reference(e, o.ra[s], o.dec[s])
     return np.where(finite, total - reference, np.nan), focal
 

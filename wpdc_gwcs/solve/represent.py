@@ -1,6 +1,6 @@
 """What was found, written down in the paper's form: polynomial, table, six numbers, field table."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -132,7 +132,7 @@ def _instrument_sigma(o, state, frame, x, y, table_sigma):
     return sigma_grid(covariance, n)
 
 
-def represent_frame(o, state, f, solution, *, n_grid):
+def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places):
     """Attitude, field and uncertainty of one frame on top of its detector's solution.
 
     Parameters
@@ -148,6 +148,10 @@ def represent_frame(o, state, f, solution, *, n_grid):
     n_grid : int
         Largest number of nodes of the field's table along each axis; 0 for no table: what is left
         is then part of the uncertainty.
+    table_sigma : (3, n, n) ndarray or None
+        Uncertainty of the smoothed table, or of a stored solution.
+    places : dict
+        Undistorted positions of grids, which all frames of a detector have in common.
 
     Returns
     -------
@@ -164,7 +168,10 @@ def represent_frame(o, state, f, solution, *, n_grid):
         return geometry.sky(e, focal)
 
     def place(x, y):
-        return np.array(solution.undistort(x, y)) - detector.crpix[:, None]
+        key = (detector.name, len(x), float(x[1]))
+        if key not in places:
+            places[key] = np.array(solution.undistort(x, y)) - detector.crpix[:, None]
+        return places[key]
 
     x, y = detector.grid(N_SIGMA)
     at = sky(x, y, True)
@@ -177,8 +184,8 @@ def represent_frame(o, state, f, solution, *, n_grid):
         field = _field_table(state, f, detector, sky, place, fit, n_grid)
     gx, gy = detector.grid(N_SIGMA)
     table = None
-    if solution.table_sigma is not None:
-        table = solution.covariance(gx, gy)
+    if table_sigma is not None:
+        table = replace(solution, table_sigma=table_sigma).covariance(gx, gy)
     covariance = predict_variance(o, state, f, gx, gy, table=table)
     if field is None:
         covariance = covariance + left[:, None] * left

@@ -287,7 +287,7 @@ def _applied(model, scopes, values, found, sigma):
             b = a[e].reshape(2, 3)
             pointing[e], cd[e] = geometry.moved(e, b[:, 0], np.eye(2) + b[:, 1:] / geometry.radius)
     geometry = replace(geometry, pointing=pointing, cd=cd)
-    return replace(model, geometry=geometry, coefficients=coefficients, sigma=sigmas)
+    return model.changed(geometry=geometry, coefficients=coefficients, sigma=sigmas)
 
 
 def _pooled(o, state, own):

@@ -6,6 +6,7 @@ import numpy as np
 
 from wpdc_gwcs.lookup import N_FOLDS, ResidualMap, build_lookup_table, choose_table
 from wpdc_gwcs.solve.state import all_residuals
+from wpdc_gwcs.solve.surface import of_table
 
 __all__ = ["choose_tables", "folds", "residual_maps", "with_tables"]
 
@@ -112,9 +113,9 @@ def with_tables(o, state, group, n_grid, lut, *, choices=None, draft=False):
     tables, infos = [], []
     for total, (choice, candidates) in zip(maps, choices or [(None, ())] * len(maps)):
         table, info = build_lookup_table(total, n_grid, choice=choice, lut=lut, draft=draft)
-        tables.append(table)
+        tables.append(None if table is None else of_table(table))
         infos.append(replace(info, candidates=candidates))
-    return replace(state, model=replace(state.model, tables=tuple(tables))), infos
+    return replace(state, model=state.model.changed(tables=tuple(tables))), infos
 
 
 def choose_tables(maps, lut):

@@ -1,0 +1,137 @@
+"""Smooth displacements sampled on a grid: quick to evaluate again and again."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import RectBivariateSpline
+
+__all__ = ["SampledField", "TableSurface", "of_field", "of_table"]
+
+# Nodes for the shortest wave of a field: the spline then is good to a thousandth of it.
+_NODES_PER_WAVE = 6
+
+# Share of its own size by which the grid of a field reaches beyond its box on each side: distortion
+# takes stars over the rim.
+_MARGIN = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class TableSurface:
+    """Displacements of a look-up table, the same bicubic spline.
+
+    Parameters
+    ----------
+    splines : tuple of RectBivariateSpline
+        Of both axes, as functions of (x, y).
+    """
+
+    splines: tuple
+
+    def __call__(self, x, y):
+        """Displacement of pixels.
+
+        Parameters
+        ----------
+        x, y : (N,) ndarray
+            Pixels.
+
+        Returns
+        -------
+        (2, N) ndarray
+            Px.
+        """
+        return np.array([spline(x, y, grid=False) for spline in self.splines])
+
+
+@dataclass(frozen=True, eq=False)
+class SampledField:
+    """A field with its values on a grid.
+
+    Parameters
+    ----------
+    field : Field
+        The field, for its covariance.
+    surface : TableSurface
+        Its values.
+    """
+
+    field: object
+    surface: TableSurface
+
+    def __call__(self, focal):
+        """Displacement at focal plane positions.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+
+        Returns
+        -------
+        (2, N) ndarray
+            Px.
+        """
+        return self.surface(*focal)
+
+    def covariance(self, focal):
+        """Posterior covariance, see `Field`.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+
+        Returns
+        -------
+        (2, 2, N) ndarray
+            Px^2.
+        """
+        return self.field.covariance(focal)
+
+
+def of_table(table):
+    """Put a look-up table into splines that are set up once.
+
+    Parameters
+    ----------
+    table : LookupTable
+        Table.
+
+    Returns
+    -------
+    TableSurface
+        The same displacements.
+    """
+    degree = 3 if table.method == "cubic" else 1
+    return TableSurface(
+        tuple(
+            RectBivariateSpline(table.x_grid, table.y_grid, np.asarray(d).T, kx=degree, ky=degree)
+            for d in (table.dx, table.dy)
+        )
+    )
+
+
+def of_field(field, low, high):
+    """Sample a field over a box of the focal plane.
+
+    Parameters
+    ----------
+    field : Field
+        Field.
+    low, high : (2,) ndarray
+        Corners, px.
+
+    Returns
+    -------
+    SampledField
+        The field on a grid.
+    """
+    size = high - low
+    shortest = 2 * np.pi / np.abs(field.basis.wave).max(axis=1)
+    n = np.ceil(_NODES_PER_WAVE * size / shortest).astype(int) + 4
+    grids = [
+        np.linspace(a - _MARGIN * s, b + _MARGIN * s, m) for a, b, s, m in zip(low, high, size, n)
+    ]
+    x, y = np.meshgrid(*grids, indexing="ij")
+    values = field(np.array([x.ravel(), y.ravel()])).reshape(2, *x.shape)
+    return SampledField(field, TableSurface(tuple(RectBivariateSpline(*grids, v) for v in values)))
