@@ -28,8 +28,8 @@ _MOST_STATIC, _STARS_POOLED = 300, 10_000
 # Frames of an exposure that its spectrum is learnt from, those with the most stars.
 _FRAMES_PER_EXPOSURE = 6
 
-# Largest outer scale in units of the patch; of one exposure alone, whose polynomial is free, what is
-# longer than the patch is distortion.
+# Largest outer scale in units of the patch; of one exposure alone, whose polynomial is free, the
+# rest is distortion.
 _LONGEST, _LONGEST_ALONE = 4.0, 1.0
 
 # In a mosaic stars of the neighbors within this share of a detector's longer side help.

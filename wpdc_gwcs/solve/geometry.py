@@ -17,6 +17,9 @@ __all__ = ["Geometry", "start_geometry"]
 # Sky positions of a frame that stand for its linear WCS, along each axis.
 _POINTS = 4
 
+# Step on the tangent plane that tells how it turns, deg.
+_STEP = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
@@ -102,7 +105,14 @@ class Geometry:
             Of the focal plane.
         """
         cd = self.cd[exposure]
-        return np.array(deproject(*(cd @ shift), self.pointing[exposure])), cd @ matrix
+        at = cd @ shift
+        # North turns with the pointing, near a pole by as much as one likes.
+        step = at[:, None] + _STEP * np.array([[0.0, 1.0, -1.0, 0.0, 0.0],
+                                               [0.0, 0.0, 0.0, 1.0, -1.0]])  # fmt: skip
+        sky = np.array(deproject(*step, self.pointing[exposure]))
+        plane = np.array(project(*sky, sky[:, 0]))
+        turn = np.stack([plane[:, 1] - plane[:, 2], plane[:, 3] - plane[:, 4]], axis=1)
+        return sky[:, 0], turn / (2 * _STEP) @ cd @ matrix
 
 
 def start_geometry(observations):
