@@ -10,6 +10,9 @@ _LOG_SCATTER = 1.2
 
 _NEWTON_STEPS = 30
 
+# Exponent of the standard deviation for the uncertainty of its logarithm, see `inflation`.
+_TAILS = 1.5
+
 
 def learn_sequence(square, count, sigma, decay):
     """Learn the standard deviations of a sequence of groups: one step of expectation maximization.
@@ -69,10 +72,11 @@ def inflation(determined):
     -----
     The logarithm of a standard deviation is known to v = 1 / (2 n) from n coefficients, and from
     its neighbors by the random walk; for a normal distribution of the logarithm, the mean of the
-    variance is exp(2 v) times its mode.
+    variance is exp(2 v) times its mode.  Three sigma are to hold 99 % of the extrapolations, whose
+    tails are heavier than normal: exp(3 v), from `benchmarks/few_stars.py`.
     """
     precision = _walk(len(determined)) + np.diag(2.0 * np.maximum(determined, 1e-3))
-    return np.exp(np.diagonal(np.linalg.inv(precision)))
+    return np.exp(_TAILS * np.diagonal(np.linalg.inv(precision)))
 
 
 def _walk(n):
