@@ -176,20 +176,21 @@ class TestFitField:
         assert_allclose(field(there).ravel(), expected, atol=1e-10)
 
     def test_covariance_and_what_it_follows(self, rng, fitted):
+        """To single precision, in which the factor of the precision is kept."""
         field, focal, variance, _, total = fitted
         there = places(rng, 15)
         rows, star_rows = rng.normal(size=(2, 15, 3)), rng.normal(size=(2, 60, 3))
         less, covariance = field.conditioned(there, rows, focal, star_rows, 1 / variance)
         cross = dense(field.basis, field.spectrum, there, focal)
         followed = cross @ np.linalg.solve(total, star_rows.reshape(120, 3))
-        assert_allclose(less.reshape(30, 3), rows.reshape(30, 3) - followed, atol=1e-9)
+        assert_allclose(less.reshape(30, 3), rows.reshape(30, 3) - followed, atol=2e-5)
         posterior = dense(field.basis, field.spectrum, there)
         posterior -= cross @ np.linalg.solve(total, cross.T)
         posterior += field.spectrum.unresolved(field.basis) * np.eye(30)
         expected = posterior.reshape(2, 15, 2, 15)
         for a in range(2):
             for b in range(2):
-                assert_allclose(covariance[a, b], np.diagonal(expected[a, :, b]), atol=1e-10)
+                assert_allclose(covariance[a, b], np.diagonal(expected[a, :, b]), atol=1e-7)
 
     def test_far_from_stars_it_is_the_prior(self):
         basis, spectrum = patch(LOW, HIGH, 200), Spectrum(0.08, 400.0)

@@ -152,7 +152,7 @@ def file_kind(path, *, error=FileFormatError):
 
 
 @contextlib.contextmanager
-def open_fits(path, *, error=FileFormatError):
+def open_fits(path, *, error=FileFormatError, lazy=False):
     """Open a FITS file after making sure that all of it is there.
 
     Parameters
@@ -161,6 +161,8 @@ def open_fits(path, *, error=FileFormatError):
         FITS file, plain, tile-compressed, or compressed as a whole (gzip, bzip2, xz).
     error : type, optional
         Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised for any damage.
+    lazy : bool, optional
+        Read extensions when they are asked for: for one of many.
 
     Yields
     ------
@@ -175,15 +177,30 @@ def open_fits(path, *, error=FileFormatError):
     calibration; so do not warn of one's own inside the block.
     """
     path = Path(path)
-    check_complete(path, error=error)
+    _check_once(path, error)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            hdus = fits.open(path, memmap=False, lazy_load_hdus=False)
+            hdus = fits.open(path, memmap=False, lazy_load_hdus=lazy)
         except READ_ERRORS as problem:
             raise error(f"{path}: damaged FITS file: {first_line(problem)}") from problem
         with hdus:
             yield hdus
+
+
+# Files that were found complete, as they were then: each frame of a mosaic opens its file anew.
+_complete = {}
+
+
+def _check_once(path, error):
+    try:
+        state = path.stat()
+    except OSError:
+        state = None
+    seen = state and (state.st_size, state.st_mtime_ns)
+    if seen is None or _complete.get(path) != seen:
+        check_complete(path, error=error)
+        _complete[path] = seen
 
 
 def check_complete(path, *, error=FileFormatError):

@@ -414,7 +414,7 @@ def _load_image(path, index):
 
 def _load_fits_sources(path, index):
     where = f"{path}[{index}]"
-    with open_fits(path, error=FrameError) as hdus:
+    with open_fits(path, error=FrameError, lazy=True) as hdus:
         try:
             columns = hdus[index].columns
             data = hdus[index].data

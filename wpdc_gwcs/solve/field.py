@@ -534,4 +534,5 @@ def fit_field(basis, spectrum, focal, residual, variance):
     lower = np.tril(factor[0])
     inverse, _ = lapack.dtrtri(lower, lower=1)
     freedom = (len(root) - np.sum(inverse**2)) / max(focal.shape[1], 1)
-    return Field(basis, spectrum, coefficients, lower, float(freedom))
+    # A camera has a thousand of these, and no error is known to seven digits.
+    return Field(basis, spectrum, coefficients, lower.astype(np.float32), float(freedom))
