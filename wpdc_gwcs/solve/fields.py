@@ -22,6 +22,10 @@ __all__ = ["with_fields", "with_spectra", "with_statics"]
 _MOST_MARGINAL, _MOST_FINAL = 250, 1000
 _STARS_PER_WAVE_MARGINAL, _STARS_PER_WAVE = 3, 4
 
+# With more stars on each detector than this, its table finds by itself what the exposures share, and
+# finer than these waves.
+_TABLE_ALONE = 6000
+
 # Waves of what the exposures of a detector share, and stars that its spectrum is learnt from.
 _MOST_STATIC, _STARS_POOLED = 300, 10_000
 
@@ -171,7 +175,8 @@ def with_statics(o, state):
     Returns
     -------
     State
-        All detectors have a field of one spectrum, or none where their stars do not speak for it.
+        All detectors have a field of one spectrum, or none where their stars do not speak for it or
+        are so many that a table does better.
     """
     plain = replace(state, model=state.model.changed(statics={}))
     stars = {}
@@ -181,6 +186,8 @@ def with_statics(o, state):
             stars[k] = [np.concatenate([p[i] for p in parts], axis=1) for i in range(3)]
     boxes = {k: _box(o, state, k, 0.0) for k in stars}
     typical = float(np.median([columns[0].shape[1] for columns in stars.values()]))
+    if typical > _TABLE_ALONE:
+        return plain
     n = int(np.clip(typical, 12, _MOST_STATIC))
     longest = max(float(np.max(high - low)) for low, high in boxes.values())
     spacing = longest / np.sqrt(max(typical, 1.0))
