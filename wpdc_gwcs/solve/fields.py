@@ -22,8 +22,8 @@ __all__ = ["with_fields", "with_spectra", "with_statics"]
 _MOST_MARGINAL, _MOST_FINAL = 250, 1000
 _STARS_PER_WAVE_MARGINAL, _STARS_PER_WAVE = 3, 4
 
-# With more stars on each detector than this, its table finds by itself what the exposures share, and
-# finer than these waves.
+# With more stars on each detector than this, its table finds by itself what the exposures share, in
+# more detail than these waves.
 _TABLE_ALONE = 6000
 
 # Waves of what the exposures of a detector share, and stars that its spectrum is learnt from.
