@@ -2,6 +2,7 @@
 
     python benchmarks/drift.py [--trials 40] [--seeds 1 2 3 4 5]
     python benchmarks/drift.py --update [--seeds 1 2 3 4 5]
+    python benchmarks/drift.py --update-alarms [--trials 100] [--seeds 1 2 3 4 5]
 
 For each seed a solution is made of some exposures of one camera of the laboratory (``truth.py``,
 ``field.py``; see ``solution.py``); then other exposures of the same camera, of another part of the
@@ -205,6 +206,22 @@ def updates(options):
                       flush=True)  # fmt: skip
 
 
+def false_alarms(options):
+    """How often an unchanged camera moves, from one and from six new exposures."""
+    print(f"{'stars':>5s} {'px':>5s} {'new':>4s}  moved without a change")
+    for stars, turbulence in ((300, 0.03), (2000, 0.0)):
+        moved = {1: [], 6: []}
+        for seed in options.seeds:
+            camera = Simulated(np.random.default_rng(seed), stars=stars, turbulence=turbulence)
+            stored = solve_simulated(camera.expose(8))
+            for n, found in moved.items():
+                for _ in range(-(-options.trials // len(options.seeds))):
+                    updated = solve_simulated(camera.expose(n), solution=stored, update=True)
+                    found.append(updated.statistics["updates"][-1]["process_noise"] > 0)
+        for n, found in moved.items():
+            print(f"{stars:5d} {turbulence:5.2f} {n:4d}  {sum(found):3d}/{len(found):3d}", flush=True)
+
+
 def one_camera(seed, stars, turbulence, changed, rows):
     camera = Simulated(np.random.default_rng(seed), stars=stars, turbulence=turbulence)
     old = camera.expose(8)
@@ -247,9 +264,14 @@ def main():
     parser.add_argument("--cells", action="store_true", help="show what false alarms consist of")
     parser.add_argument("--update", action="store_true",
                         help="how well --update follows a wave, without the laboratory")  # fmt: skip
+    parser.add_argument("--update-alarms", action="store_true",
+                        help="how often --update moves a camera that has not changed")  # fmt: skip
     options = parser.parse_args()
     if options.update:
         updates(options)
+        return
+    if options.update_alarms:
+        false_alarms(options)
         return
     find_lab()
     print(f"{'case':13s} {'stored':>6s} {'tested':>6s}  {'change':9s} {'trials':>6s} "

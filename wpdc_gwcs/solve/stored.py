@@ -49,6 +49,10 @@ _EXPOSURES_TRIED = 12
 _LOG_STRENGTH, _GUESS_WEIGHT = 1.0, 0.5
 _LEAST_STRENGTH = 0.1
 
+# The uncertainty of a stored map is itself an estimate, taken so many times larger (as in
+# `detect_drift`), and has as many parameters as a polynomial of degree 7 where it has no table.
+_STALE_MARGIN, _FREEDOM = 1.5, 36.0
+
 # Points along each axis on which a change is averaged.
 _POINTS = 24
 
@@ -89,9 +93,9 @@ class Change:
     ----------
     basis : Basis
         Waves, for each axis.
-    coefficients : (2, M) ndarray
-        Of the waves.
-    half : (2, M, M) ndarray
+    coefficients : (2, M + 3) ndarray
+        Of the waves, and of the linear part that attitudes take from them.
+    half : (2, M, M + 3) ndarray
         Products of these with themselves, H^T H, are the covariances.
     variance : float
         Variance added to the stored map along each axis (process noise), px^2; 0 for no change.
@@ -116,7 +120,7 @@ class Change:
         focal : (2, N) ndarray
             Focal plane, px.
         """
-        return self.coefficients @ _waves(self.basis, focal).T
+        return self.coefficients @ _columns(self.basis, focal).T
 
     def covariance(self, focal):
         """Posterior covariance ``(2, 2, N)``, px^2.
@@ -126,7 +130,7 @@ class Change:
         focal : (2, N) ndarray
             Focal plane, px.
         """
-        rows = _waves(self.basis, focal)
+        rows = _columns(self.basis, focal)
         out = np.zeros((2, 2, focal.shape[1]))
         for a in range(2):
             out[a, a] = np.sum((self.half[a] @ rows.T) ** 2, axis=0)
@@ -160,7 +164,8 @@ def find_change(o, state, k, stored):
     Returns
     -------
     change : Change
-        What the evidence says; zero if it speaks for none.
+        What the evidence says, of the variance 0 if it speaks for none: then what the stored
+        solution may well have been wrong by.
     common : Change
         What the exposures have in common whatever the evidence, not drawn to zero.
 
@@ -175,6 +180,7 @@ def find_change(o, state, k, stored):
     counts = [int(state.kept[o.slices[f]].sum()) for f in frames]
     detector = o.detectors[k]
     corners = state.model.geometry.focal(k, detector, *detector.grid(2))
+    focal = state.model.geometry.focal(k, detector, *detector.grid(_POINTS))
     n = int(np.clip(sum(counts) / _STARS_PER_WAVE, 12, _MOST_WAVES))
     basis = patch(corners.min(1), corners.max(1), n)
     known = stored.statistics.get("fields")
@@ -185,16 +191,52 @@ def find_change(o, state, k, stored):
     scales = np.log([min(2 * spacing, 0.5 * longest), 4 * longest])
     prior = _FieldPrior(known, errors, scales)
     step = -(-len(products) // _EXPOSURES_TRIED)
-    field, change, gain = _spectra(products[::step], basis, prior, errors, scales)
+    stale = _stale_power(stored, basis, detector)
+    field, change, gain = _spectra(products[::step], basis, prior, errors, scales, stale)
     found = gain > _AGAINST_CHANGE + _LEAST_GAIN
     broad = Spectrum(10 * max(errors, change.amplitude), change.scale)
-    zero = np.zeros((2, n)), np.zeros((2, n, n))
-    one = _posterior(products, basis, field, change) if found else zero
+    one = _posterior(products, basis, field, stale + found * _power(change, basis))
     variance = change.amplitude**2 if found else 0.0
-    return (
-        Change(basis, *one, variance, gain, field),
-        Change(basis, *_posterior(products, basis, field, broad), variance, gain, field),
+    both = _posterior(products, basis, field, _power(broad, basis))
+    return tuple(
+        Change(basis, *_without_linear(basis, focal, *found), variance, gain, field)
+        for found in (one, both)
     )
+
+
+def _without_linear(basis, focal, coefficients, half):
+    """Waves and linear columns of a change without what attitudes take of it, over a detector."""
+    rows, free = _waves(basis, focal), _linear(basis, focal)
+    taken = np.linalg.lstsq(free, rows, rcond=None)[0].T
+    return (
+        np.hstack([coefficients, -coefficients @ taken]),
+        np.concatenate([half, -half @ taken], axis=2),
+    )
+
+
+def _linear(basis, focal):
+    u = (focal - basis.center[:, None]) / basis.half[:, None]
+    return np.stack([np.ones(focal.shape[1]), *u], axis=1)
+
+
+def _columns(basis, focal):
+    return np.hstack([_waves(basis, focal), _linear(basis, focal)])
+
+
+def _stale_power(stored, basis, detector):
+    """Variances of the waves that the stored table is uncertain by: the same for as many as it has
+    parameters."""
+    out = np.zeros(basis.orders.shape[1])
+    x, y = detector.grid(_POINTS)
+    variance = _STALE_MARGIN**2 * float(np.mean(stored.covariance(x, y)[[0, 1], [0, 1]]))
+    if not variance > 0:
+        return out
+    freedom = stored.statistics.get("table", {}).get("freedom") or _FREEDOM
+    # On the patch, which is larger than the detector; sines of both axes have squares of 1/4.
+    share = 4 * np.prod(basis.half) / np.prod(detector.image_shape)
+    n = int(np.clip(freedom * share, 6, len(out)))
+    out[:n] = 4 * variance * np.prod(basis.half) / n
+    return out
 
 
 def _normal(o, state, f, basis, known):
@@ -206,8 +248,7 @@ def _normal(o, state, f, basis, known):
     if known and known["amplitude"] > 0:
         variance = variance + Spectrum(known["amplitude"], known["scale"]).unresolved(basis)
     rows = _waves(basis, focal[:, kept])
-    u = (focal[:, kept] - basis.center[:, None]) / basis.half[:, None]
-    free = np.stack([np.ones(kept.sum()), *u], axis=1)
+    free = _linear(basis, focal[:, kept])
     out = []
     for r, v in zip(-residual[:, kept], variance):
         w = 1.0 / v
@@ -231,7 +272,8 @@ class _FieldPrior:
         level = np.log(0.5 * errors)
         self.scatter = 1.5
         if known:
-            self.scale = float(np.clip(np.log(known["scale"]), *scales))
+            if known["amplitude"] > 0:
+                self.scale = float(np.clip(np.log(known["scale"]), *scales))
             level = np.log(max(known["amplitude"], _LEAST_STRENGTH * errors))
             self.scatter = known["scatter"]
         self.strength = level - 5 / 6 * self.scale
@@ -242,7 +284,7 @@ class _FieldPrior:
         return 0.5 * strength**2 + 0.5 * ((scale - self.scale) / 0.7) ** 2
 
 
-def _spectra(products, basis, prior, errors, scales):
+def _spectra(products, basis, prior, errors, scales, stale):
     """Spectra of fields and change of the largest evidence, and its gain over no change."""
     low, high = scales
 
@@ -253,8 +295,8 @@ def _spectra(products, basis, prior, errors, scales):
         if not np.all(np.abs(p[::2]) < 25):
             return 1e12
         beyond = np.maximum(low - p[1::2], 0) + np.maximum(p[1::2] - high, 0)
-        change = None if len(p) == 2 else spectrum(p[2:])
-        penalty = prior.penalty(p[0], p[1]) + np.sum(beyond**2)
+        change = stale if len(p) == 2 else stale + _power(spectrum(p[2:]), basis)
+        penalty = prior.penalty(p[0], np.clip(p[1], low, high)) + 10 * np.sum(beyond**2)
         return penalty - _log_evidence(products, basis, spectrum(p[:2]), change)
 
     def best(starts):
@@ -299,16 +341,15 @@ def _log_evidence(products, basis, field, change):
     for a in range(2):
         left = [_marginal(*axes[a], power) for axes in products]
         total += sum(part[2] for part in left)
-        if change is not None:
-            normal, right = (sum(part[i] for part in left) for i in range(2))
-            total += _marginal(normal, right, _power(change, basis))[2]
+        normal, right = (sum(part[i] for part in left) for i in range(2))
+        total += _marginal(normal, right, change)[2]
     return total
 
 
 def _posterior(products, basis, field, change):
     """Coefficients of a change of known spectrum, and the halves of their covariances."""
     means, halves = [], []
-    power, root = _power(field, basis), np.sqrt(_power(change, basis))
+    power, root = _power(field, basis), np.sqrt(change)
     for a in range(2):
         left = [_marginal(*axes[a], power) for axes in products]
         normal, right = (sum(part[i] for part in left) for i in range(2))
@@ -435,10 +476,12 @@ def updated_solution(o, state, k, change, solution, new, n_grid):
     table, info = build_lookup_table(merged, n_grid, choice=choice)
     info = replace(info, candidates=candidates)
     sigma = info.sigma
-    if moved and sigma is not None:
+    if change is not None and sigma is not None:
+        # The table knows the errors of the stars, not the fields of the exposures.
         x, y = o.detectors[k].grid(n_grid)
         _, covariance = change_on(o, state, k, change, x, y)
         spread = np.sqrt(covariance[[0, 1], [0, 1]]).reshape(2, n_grid, n_grid)
+        spread /= 1.0 if moved else _STALE_MARGIN
         sigma = np.array([*np.maximum(sigma[:2], spread), sigma[2]])
     statistics = {**solution.statistics,
                   "updates": [*solution.statistics.get("updates", []), entry]}  # fmt: skip
@@ -473,10 +516,7 @@ def follow(o, state, k, change, solution):
     """
     x, y = o.detectors[k].grid(_POINTS)
     moved, covariance = change_on(o, state, k, change, x, y)
-    # What attitudes take is no change of the instrument.
-    rows = np.stack([np.ones_like(x), x - x.mean(), y - y.mean()], axis=1)
-    rest = moved.T - rows @ np.linalg.lstsq(rows, moved.T, rcond=None)[0]
-    size = np.hypot(*rest.T)
+    size = np.hypot(*moved)
     before = np.nanmean(solution.covariance(x, y)[[0, 1], [0, 1]])
     if not np.isfinite(before):
         before = 0.0
@@ -509,13 +549,13 @@ def summarize_fields(spectra, previous=None):
         ``scatter`` of the logarithm of the strength; amplitude 0 where there were no fields.
     """
     found = [s for s in spectra if s is not None]
-    n = len(spectra)
+    n, guess = len(spectra), _GUESS_WEIGHT * _LOG_STRENGTH**2
     if not found:
-        own = {"n": n, "amplitude": 0.0, "scale": 1.0, "scatter": _LOG_STRENGTH}
+        scatter = np.sqrt(guess / max(n - 1 + _GUESS_WEIGHT, 1))
+        own = {"n": n, "amplitude": 0.0, "scale": 1.0, "scatter": float(scatter)}
     else:
         scale = np.mean([np.log(s.scale) for s in found])
         strengths = np.array([np.log(s.amplitude) - 5 / 6 * np.log(s.scale) for s in found])
-        guess = _GUESS_WEIGHT * _LOG_STRENGTH**2
         square = guess + np.sum((strengths - strengths.mean()) ** 2)
         own = {
             "n": n,
