@@ -219,7 +219,9 @@ def false_alarms(options):
                     updated = solve_simulated(camera.expose(n), solution=stored, update=True)
                     found.append(updated.statistics["updates"][-1]["process_noise"] > 0)
         for n, found in moved.items():
-            print(f"{stars:5d} {turbulence:5.2f} {n:4d}  {sum(found):3d}/{len(found):3d}", flush=True)
+            print(
+                f"{stars:5d} {turbulence:5.2f} {n:4d}  {sum(found):3d}/{len(found):3d}", flush=True
+            )
 
 
 def one_camera(seed, stars, turbulence, changed, rows):
@@ -263,7 +265,7 @@ def main():
                         help="rms of waves that differ between exposures")  # fmt: skip
     parser.add_argument("--cells", action="store_true", help="show what false alarms consist of")
     parser.add_argument("--update", action="store_true",
-                        help="how well --update follows a wave, without the laboratory")  # fmt: skip
+                        help="how well --update follows a wave, no laboratory")  # fmt: skip
     parser.add_argument("--update-alarms", action="store_true",
                         help="how often --update moves a camera that has not changed")  # fmt: skip
     options = parser.parse_args()

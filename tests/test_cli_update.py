@@ -127,4 +127,4 @@ def test_what_is_no_solution_is_refused(inputs, updated, tmp_path, capsys):
     assert run([*command, "--solution", str(wrong), "--update"]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
-    assert "--solution needs a *.solution.asdf file" in lines[0]
+    assert "--solution needs a *.solution.asdf or *.camera.asdf file" in lines[0]

@@ -489,7 +489,10 @@ def _result(o, state, stored, infos, group, settings, cd, update):
         weight = weights[detector.name]
         solutions[detector.name] = replace(
             solution,
-            statistics={**solution.statistics, **_statistics(o, state, k, infos[k], solution, settings)},
+            statistics={
+                **solution.statistics,
+                **_statistics(o, state, k, infos[k], solution, settings),
+            },
             settings={**settings, "weight": weight.name, "r0": float(weight.r0)},
         )
     residual = all_residuals(o, state)
@@ -541,7 +544,9 @@ def _statistics(o, state, k, info, solution, settings):
     }  # fmt: skip
     if settings["lut"] != "none" and settings["refine"] in ("auto", "field"):
         statistics["fields"] = summarize_fields(
-            [state.spectrum(o, f) for f in frames], solution.statistics.get("fields")
+            [state.spectrum(o, f) for f in frames],
+            solution.image_shape,
+            solution.statistics.get("fields"),
         )
     if state.pooled:
         statistics["attitude_variation"] = state.pooled

@@ -148,7 +148,7 @@ def _power(spectrum, basis):
 
 
 def find_change(o, state, k, stored):
-    """What the new exposures of a detector have in common beyond a stored solution.
+    """Find what the new exposures of a detector have in common beyond a stored solution.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def find_change(o, state, k, stored):
     longest = 2 * float(basis.half.max())
     spacing = longest / np.sqrt(max(np.median(counts), 1.0))
     scales = np.log([min(2 * spacing, 0.5 * longest), 4 * longest])
-    prior = _FieldPrior(known, errors, scales)
+    prior = _FieldPrior(known, errors, scales, 0.5 * max(detector.image_shape))
     step = -(-len(products) // _EXPOSURES_TRIED)
     stale = _stale_power(stored, basis, detector)
     field, change, gain = _spectra(products[::step], basis, prior, errors, scales, stale)
@@ -224,8 +224,10 @@ def _columns(basis, focal):
 
 
 def _stale_power(stored, basis, detector):
-    """Variances of the waves that the stored table is uncertain by: the same for as many as it has
-    parameters."""
+    """Variances of the waves by the uncertainty of the stored table.
+
+    The same for as many waves as it has parameters.
+    """
     out = np.zeros(basis.orders.shape[1])
     x, y = detector.grid(_POINTS)
     variance = _STALE_MARGIN**2 * float(np.mean(stored.covariance(x, y)[[0, 1], [0, 1]]))
@@ -240,7 +242,7 @@ def _stale_power(stored, basis, detector):
 
 
 def _normal(o, state, f, basis, known):
-    """Normal matrices and right-hand sides of a frame along both axes, its attitude taken out."""
+    """Accumulate the normal equations of a frame along both axes, its attitude taken out."""
     s = o.slices[f]
     kept = state.kept[s]
     residual, focal = residuals(state.model, o, f, with_field=False)
@@ -256,17 +258,17 @@ def _normal(o, state, f, basis, known):
         cross, normal = free.T @ heavy, (free * w[:, None]).T @ free
         right = np.column_stack([cross, free.T @ (w * r)])
         solved = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
-        out.append((heavy.T @ rows - cross.T @ solved[:, :-1], heavy.T @ r - cross.T @ solved[:, -1]))
+        out.append(
+            (heavy.T @ rows - cross.T @ solved[:, :-1], heavy.T @ r - cross.T @ solved[:, -1])
+        )
     return out
 
 
 class _FieldPrior:
-    """What is known of the strength of an exposure's field: ``amplitude * scale^(-5/6)``.
+    """What is known of the strength of an exposure's field, see `_strength`."""
 
-    That is what a detector sees of the turbulence; the outer scale is mostly larger than it.
-    """
-
-    def __init__(self, known, errors, scales):
+    def __init__(self, known, errors, scales, wavelength):
+        self.wavelength = wavelength
         self.known = bool(known)
         self.scale = 0.5 * scales.sum()
         level = np.log(0.5 * errors)
@@ -276,12 +278,21 @@ class _FieldPrior:
                 self.scale = float(np.clip(np.log(known["scale"]), *scales))
             level = np.log(max(known["amplitude"], _LEAST_STRENGTH * errors))
             self.scatter = known["scatter"]
-        self.strength = level - 5 / 6 * self.scale
+        self.strength = level + _strength(0.0, self.scale, wavelength)
 
     def penalty(self, amplitude, scale):
         """Minus the log prior of the logarithms of amplitude and scale."""
-        strength = (amplitude - 5 / 6 * scale - self.strength) / self.scatter
-        return 0.5 * strength**2 + 0.5 * ((scale - self.scale) / 0.7) ** 2
+        strength = _strength(amplitude, scale, self.wavelength) - self.strength
+        return 0.5 * (strength / self.scatter) ** 2 + 0.5 * ((scale - self.scale) / 0.7) ** 2
+
+
+def _strength(amplitude, scale, wavelength):
+    """Logarithm of the root of a field's power at a wavelength, from those of amplitude and scale.
+
+    At half the side of a detector it is well known; amplitude and outer scale, mostly larger than
+    the detector, are not.
+    """
+    return amplitude + scale - 11 / 12 * np.log1p((np.exp(scale) / wavelength) ** 2)
 
 
 def _spectra(products, basis, prior, errors, scales, stale):
@@ -302,12 +313,21 @@ def _spectra(products, basis, prior, errors, scales, stale):
     def best(starts):
         p = np.array(min(starts, key=cost))
         n = len(p)
-        found = minimize(cost, p, method="Nelder-Mead",
-                         options={"xatol": 0.05, "fatol": 0.1, "maxfev": 60 * n,
-                                  "initial_simplex": p + np.vstack([np.zeros(n), 0.4 * np.eye(n)])})
+        found = minimize(
+            cost,
+            p,
+            method="Nelder-Mead",
+            options={
+                "xatol": 0.05,
+                "fatol": 0.1,
+                "maxfev": 60 * n,
+                "initial_simplex": p + np.vstack([np.zeros(n), 0.4 * np.eye(n)]),
+            },
+        )
         return found.x, -found.fun  # fmt: skip
 
-    usual = np.array([prior.strength + 5 / 6 * prior.scale, prior.scale])
+    level = prior.strength - _strength(0.0, prior.scale, prior.wavelength)
+    usual = np.array([level, prior.scale])
     alone, plain = best([usual + [a, 0.0] for a in (0.0, 1.0, 2.0)])
     middle = 0.5 * (low + high)
     starts = [
@@ -322,7 +342,7 @@ def _spectra(products, basis, prior, errors, scales, stale):
 
 
 def _marginal(normal, right, power):
-    """What a field of a prior leaves of normal equations, and the log evidence of the field."""
+    """Give what a field leaves of normal equations, and the log evidence of the field."""
     root = np.sqrt(power)
     inner = normal * root[:, None] * root
     inner[np.diag_indices_from(inner)] += 1.0
@@ -427,7 +447,7 @@ def change_on(o, state, k, change, x, y):
 
 
 def updated_solution(o, state, k, change, solution, new, n_grid):
-    """Stored solution with the residuals of new exposures, and how its table came about.
+    """Add the residuals of new exposures to a stored solution, and make its table anew.
 
     Parameters
     ----------
@@ -532,13 +552,15 @@ def follow(o, state, k, change, solution):
     }
 
 
-def summarize_fields(spectra, previous=None):
+def summarize_fields(spectra, image_shape, previous=None):
     """Typical field of some exposures, for the updates to come.
 
     Parameters
     ----------
     spectra : sequence of Spectrum or None
         Of the exposures; `None` for none.
+    image_shape : (int, int)
+        Shape of the detector.
     previous : dict, optional
         The same of the exposures of the stored solution.
 
@@ -555,11 +577,14 @@ def summarize_fields(spectra, previous=None):
         own = {"n": n, "amplitude": 0.0, "scale": 1.0, "scatter": float(scatter)}
     else:
         scale = np.mean([np.log(s.scale) for s in found])
-        strengths = np.array([np.log(s.amplitude) - 5 / 6 * np.log(s.scale) for s in found])
+        wavelength = 0.5 * max(image_shape)
+        strengths = np.array(
+            [_strength(np.log(s.amplitude), np.log(s.scale), wavelength) for s in found]
+        )
         square = guess + np.sum((strengths - strengths.mean()) ** 2)
         own = {
             "n": n,
-            "amplitude": float(np.exp(strengths.mean() + 5 / 6 * scale)),
+            "amplitude": float(np.exp(strengths.mean() - _strength(0.0, scale, wavelength))),
             "scale": float(np.exp(scale)),
             "scatter": float(np.sqrt(square / max(len(found) - 1 + _GUESS_WEIGHT, 1))),
         }
