@@ -215,6 +215,10 @@ def _dated(solution, frames, stored):
     solution = replace(solution, statistics=statistics)
     if last["process_noise"] == 0:
         return solution
+    log.info(
+        "detector %s has changed by %.3g px rms, %.3g px at most (log evidence %.1f)",
+        solution.detector, last["rms_change_px"], last["max_change_px"], last["evidence"],
+    )  # fmt: skip
     earlier = stored.provenance.get("epochs") or []
     if first is None or (earlier and first <= earlier[1]):
         log.warning(

@@ -7,7 +7,6 @@
                       a change: the stored ones are moved by it and count for less, then pooled
 """
 
-import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,8 +27,6 @@ __all__ = [
     "unswallowed_maps",
     "updated_solution",
 ]
-
-log = logging.getLogger(__name__)
 
 # Waves of a change, and stars for each.
 _MOST_WAVES, _STARS_PER_WAVE = 120, 2
@@ -486,11 +483,6 @@ def updated_solution(o, state, k, change, solution, new, n_grid):
     if moved:
         old, summary = follow(o, state, k, change, solution)
         entry |= summary
-        log.warning(
-            "detector %s has changed by %.3g px rms, %.3g px at most: the stored solution follows "
-            "(log evidence %.1f)", solution.detector, entry["rms_change_px"],
-            entry["max_change_px"], entry["evidence"],
-        )  # fmt: skip
     merged = old + new
     choice, candidates = choose_table(merged)
     table, info = build_lookup_table(merged, n_grid, choice=choice)
