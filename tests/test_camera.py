@@ -99,6 +99,13 @@ def test_a_stored_camera_is_updated(stars, catalog, solved, path, tmp_path):
         before = solved[0].solutions[name].residual_map.n_stars
         assert one.residual_map.n_stars > before
         assert one.statistics["updates"][-1]["process_noise"] == 0
+        # The table that the whole camera has made is not made anew of one detector's stars.
+        table = solved[0].solutions[name].lookup_table
+        assert np.abs(one.lookup_table.dx - table.dx).max() < 0.05
+        assert (
+            one.statistics["learned"].keys()
+            == solved[0].solutions[name].statistics["learned"].keys()
+        )
     Results(tmp_path, frames, overwrite=False).write(run)
     assert set(read(tmp_path / "CAM.camera.asdf").detectors) == set(CENTERS)
 

@@ -195,3 +195,18 @@ def test_fields_of_several_runs_are_pooled():
     none = summarize_fields([None] * 8, (SIDE, SIDE))
     assert none["amplitude"] == 0
     assert none["scatter"] < 0.5
+
+
+@pytest.mark.parametrize("wave", [0.0, WAVE])
+def test_few_stars_do_not_cost_the_table(camera, wave):
+    # 40 stars carry no table by themselves; what is known of the detector stays.
+    truth, stored = camera
+    light = replace(stored, residual_map=ResidualMap((SIDE, SIDE)))
+    truth.wave = wave
+    exposures = truth.expose(4, stars=12)
+    updated = solved(exposures, solution=light, update=True).solution
+    before, after = truth.error(stored), truth.error(updated)
+    truth.wave = 0.0
+    assert updated.lookup_table is not None
+    assert after < 1.2 * before
+    assert last(updated)["n_exposures"] == 4

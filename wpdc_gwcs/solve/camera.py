@@ -539,7 +539,8 @@ def _statistics(o, state, k, info, solution, settings):
     statistics |= {
         "error_scale": first["scale"], "error_floor": first["floor"],
         "error_models": state.error_models,
-        "learned": {t.name: [float(v) for v in state.model.sigma[t.name]]
+        "learned": solution.statistics.get("learned", {})
+                 | {t.name: [float(v) for v in state.model.sigma[t.name]]
                     for t in state.model.terms if t.decay or t.chromatic},
     }  # fmt: skip
     if settings["lut"] != "none" and settings["refine"] in ("auto", "field"):

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.linalg import lapack
 from scipy.optimize import minimize
 
-from wpdc_gwcs.lookup import build_lookup_table, choose_table
+from wpdc_gwcs.lookup import TableChoice, build_lookup_table, choose_table
+from wpdc_gwcs.models import LookupTable
 from wpdc_gwcs.solve.field import Basis, Spectrum, patch
 from wpdc_gwcs.solve.fields import with_fields
 from wpdc_gwcs.solve.model import focal_variance, residuals, undistorted
@@ -484,23 +485,46 @@ def updated_solution(o, state, k, change, solution, new, n_grid):
         old, summary = follow(o, state, k, change, solution)
         entry |= summary
     merged = old + new
-    choice, candidates = choose_table(merged)
+    # The table of a detector of a mosaic comes from more than its own stars.
+    of_mosaic = "optics" in solution.statistics.get("learned", {}) or len(o.detectors) > 1
+    choice, candidates = (TableChoice("none"), ()) if of_mosaic else choose_table(merged)
     table, info = build_lookup_table(merged, n_grid, choice=choice)
-    info = replace(info, candidates=candidates)
-    sigma = info.sigma
-    if change is not None and sigma is not None:
+    sigma, info = info.sigma, replace(info, candidates=candidates)
+    if table is None:
+        table, sigma, info = solution.lookup_table, solution.table_sigma, None
+        if change is not None:
+            table = _moved_table(o, state, k, change, table, n_grid)
+    if change is not None:
         # The table knows the errors of the stars, not the fields of the exposures.
         x, y = o.detectors[k].grid(n_grid)
         _, covariance = change_on(o, state, k, change, x, y)
         spread = np.sqrt(covariance[[0, 1], [0, 1]]).reshape(2, n_grid, n_grid)
         spread /= 1.0 if moved else _STALE_MARGIN
-        sigma = np.array([*np.maximum(sigma[:2], spread), sigma[2]])
+        if info is None:
+            sigma = np.array([*spread, np.zeros_like(spread[0])])
+        else:
+            sigma = np.array([*np.maximum(sigma[:2], spread), sigma[2]])
     statistics = {**solution.statistics,
                   "updates": [*solution.statistics.get("updates", []), entry]}  # fmt: skip
     return replace(
         solution, lookup_table=table, table_sigma=sigma, residual_map=merged,
         statistics=statistics,
     ), info  # fmt: skip
+
+
+def _moved_table(o, state, k, change, table, n_grid):
+    """Table of a detector after a change, which may be the first to need one."""
+    if not np.any(change.coefficients):
+        return table
+    if table is None:
+        shape = o.detectors[k].image_shape
+        edges = [np.linspace(-0.5, n - 0.5, n_grid) for n in shape[::-1]]
+        zero = np.zeros((n_grid, n_grid))
+        table = LookupTable(*edges, zero, zero)
+    x, y = np.meshgrid(table.x_grid, table.y_grid)
+    shift, _ = change_on(o, state, k, change, x.ravel(), y.ravel())
+    dx, dy = np.array([table.dx, table.dy]) - shift.reshape(2, *x.shape)
+    return LookupTable(table.x_grid, table.y_grid, dx, dy, method=table.method)
 
 
 def follow(o, state, k, change, solution):
