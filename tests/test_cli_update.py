@@ -176,7 +176,7 @@ def test_a_change_is_told_and_dated(halves, followed):
 
 def test_the_command_line_says_what_has_changed(halves, inputs, later, tmp_path, capsys):
     for (frames, reference), words in (
-        (later, ("sim: changed by 2018.", "px rms", "the old solution is in sim.until-2018.")),
+        (later, ("sim: changed before 2018.", "px rms", "the old solution is in sim.until-2018.")),
         ((inputs[0][3:], inputs[1]), ("sim: no change found, 3 exposures added",)),
     ):
         status = run(

@@ -447,7 +447,7 @@ def print_changes(run):
         if last["process_noise"] == 0:
             typer.echo(f"{name}: no change found, {exposures} added")
             continue
-        since = "" if last.get("first_epoch") is None else f" by {last['first_epoch']:.4f}"
+        since = "" if last.get("first_epoch") is None else f" before {last['first_epoch']:.4f},"
         kept = ""
         if name in run.superseded:
             kept = f"; the old solution is in {superseded_name(run.superseded[name])}"
