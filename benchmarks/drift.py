@@ -1,6 +1,8 @@
 """How often a changed look-up table is found, and how often an unchanged one is called changed.
 
     python benchmarks/drift.py [--trials 40] [--seeds 1 2 3 4 5]
+    python benchmarks/drift.py --update [--seeds 1 2 3 4 5]
+    python benchmarks/drift.py --update-alarms [--trials 100] [--seeds 1 2 3 4 5]
 
 For each seed a solution is made of some exposures of one camera of the laboratory (``truth.py``,
 ``field.py``; see ``solution.py``); then other exposures of the same camera, of another part of the
@@ -9,9 +11,16 @@ over a quarter of the detector: the same everywhere in it, a gradient, a bump, o
 is the share of the changed part in the cells named, "false area" the share of the unchanged part
 in them; "found" is the amplitude that is reported for a change of the size "true", both in px over
 the cells that are named.
+
+With ``--update`` a camera of its own is solved from 8 exposures; a wave of half the detector's
+length and 0.18 px amplitude is added to it or not, and up to 6 new exposures update the stored
+solution, together or one after the other.  "stored", "updated", "all" are root mean square errors
+of the map (both axes, px): of the stored solution, of the updated one, of all exposures solved
+together; "ratio" is that of the last two, "moved" says how often a change was found.
 """
 
 import argparse
+import dataclasses
 import time
 
 import numpy as np
@@ -113,6 +122,137 @@ def judge(drift, changed, truth):
     return named[inside].mean(), named[~inside].mean(), drift.amplitude, amplitude
 
 
+SIDE = 2048
+WAVE = 0.18
+
+
+class Simulated:
+    """A camera with smooth distortion and finer structure; its exposures have turbulence."""
+
+    cd = np.array([[-2e-5, 3e-7], [3e-7, 2e-5]])
+
+    def __init__(self, rng, *, stars, turbulence, noise=0.03):
+        self.rng, self.stars, self.turbulence, self.noise = rng, stars, turbulence, noise
+        self.wave = None
+        self.angle, self.phase, self.toward = rng.uniform(0, 2 * np.pi, 3)
+        self.fine = rng.uniform(0, 2 * np.pi, 4)
+
+    def change(self):
+        """Let a wave of half the detector's length run over it from now on."""
+        self.wave = WAVE
+
+    def displacement(self, x, y):
+        u, v = 2 * x / SIDE - 1, 2 * y / SIDE - 1
+        r = u * u + v * v
+        dx = 4 * u * r + 0.8 * u * v + 0.5 * u**3 * v**2
+        dy = 4 * v * r - 0.5 * u * u - 0.4 * u**5
+        dx = dx + 0.05 * np.sin(5 * u + self.fine[0]) * np.sin(4 * v + self.fine[1])
+        dy = dy + 0.05 * np.sin(4 * u + self.fine[2]) * np.sin(5 * v + self.fine[3])
+        if self.wave is not None:
+            k = 2 * np.pi * (np.cos(self.angle) * u + np.sin(self.angle) * v)
+            size = self.wave * np.sin(k + self.phase)
+            dx, dy = dx + np.cos(self.toward) * size, dy + np.sin(self.toward) * size
+        return np.array([dx, dy])
+
+    def expose(self, n):
+        from wpdc_gwcs.models import deproject
+        from wpdc_gwcs.solve import Exposure
+
+        out = []
+        for k in range(n):
+            crval = 40.0 + 0.01 * self.rng.normal(size=2)
+            x, y = self.rng.uniform(0, SIDE - 1, (2, self.stars))
+            place = self.displacement(x, y) + np.array([x, y]) - 0.5 * (SIDE - 1)
+            place += self.turbulence * seeing(self.rng, x, y)
+            cd = self.cd * (1 + 1e-5 * self.rng.normal())
+            ra, dec = deproject(*(cd @ place), crval)
+            x, y = np.array([x, y]) + self.noise * self.rng.normal(size=(2, self.stars))
+            error = np.full(self.stars, self.noise)
+            out.append(Exposure(f"e{k}", x, y, ra, dec, crval, self.cd, error, error))
+        return out
+
+    def error(self, solution, n=41):
+        """Root mean square of the error of the distortion, both axes, without a linear part."""
+        x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(0, SIDE - 1, n)] * 2))
+        found = np.array(solution.undistort(x, y))
+        true = self.displacement(x, y) + [x, y]
+        rows = np.stack([np.ones_like(x), *found], axis=1)
+        rest = true.T - rows @ np.linalg.lstsq(rows, true.T, rcond=None)[0]
+        return float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
+
+
+def solve_simulated(exposures, **options):
+    from wpdc_gwcs.solve import solve as solve_camera
+
+    return solve_camera(exposures, image_shape=(SIDE, SIDE), **options).solution
+
+
+def updates(options):
+    """Table of the errors of the map before and after updates, and of the alarms."""
+    print(f"{'stars':>5s} {'px':>5s} {'change':7s} {'new':>6s} {'stored':>8s} {'updated':>8s} "
+          f"{'all':>8s} {'ratio':>6s} {'moved':>7s} {'s':>5s}")  # fmt: skip
+    for stars, turbulence in ((300, 0.03), (2000, 0.0)):
+        for changed in (True, False):
+            rows = {}
+            for seed in options.seeds:
+                one_camera(seed, stars, turbulence, changed, rows)
+            for new, values in rows.items():
+                stored, updated, together, moved, seconds = np.array(values, float).T
+                whole = "" if np.isnan(together).any() else (
+                    f"{np.mean(together):8.4f} {np.mean(updated / together):6.3f}")  # fmt: skip
+                print(f"{stars:5d} {turbulence:5.2f} {'wave' if changed else 'none':7s} {new:>6s} "
+                      f"{np.mean(stored):8.4f} {np.mean(updated):8.4f} {whole:15s} "
+                      f"{int(moved.sum()):3d}/{len(moved):3d} {seconds.mean():5.1f}",
+                      flush=True)  # fmt: skip
+
+
+def false_alarms(options):
+    """How often an unchanged camera moves, from one and from six new exposures."""
+    print(f"{'stars':>5s} {'px':>5s} {'new':>4s}  moved without a change")
+    for stars, turbulence in ((300, 0.03), (2000, 0.0)):
+        moved = {1: [], 6: []}
+        for seed in options.seeds:
+            camera = Simulated(np.random.default_rng(seed), stars=stars, turbulence=turbulence)
+            stored = solve_simulated(camera.expose(8))
+            for n, found in moved.items():
+                for _ in range(-(-options.trials // len(options.seeds))):
+                    updated = solve_simulated(camera.expose(n), solution=stored, update=True)
+                    found.append(updated.statistics["updates"][-1]["process_noise"] > 0)
+        for n, found in moved.items():
+            print(
+                f"{stars:5d} {turbulence:5.2f} {n:4d}  {sum(found):3d}/{len(found):3d}", flush=True
+            )
+
+
+def one_camera(seed, stars, turbulence, changed, rows):
+    camera = Simulated(np.random.default_rng(seed), stars=stars, turbulence=turbulence)
+    old = camera.expose(8)
+    stored = solve_simulated(old)
+    if changed:
+        camera.change()
+    new = camera.expose(6)
+    before = camera.error(stored)
+
+    def row(name, solution, n, seconds, together=np.nan):
+        found = [u["process_noise"] > 0 for u in solution.statistics["updates"][-n:]]
+        rows.setdefault(name, []).append(
+            (before, camera.error(solution), together, any(found), seconds)
+        )
+
+    for n in (1, 6):
+        start = time.perf_counter()
+        updated = solve_simulated(new[:n], solution=stored, update=True)
+        seconds = time.perf_counter() - start
+        together = np.nan if changed else camera.error(
+            solve_simulated([*old, *(dataclasses.replace(e, name="n" + e.name) for e in new[:n])])
+        )  # fmt: skip
+        row(str(n), updated, 1, seconds, together)
+    start, one = time.perf_counter(), stored
+    for e in new:
+        one = solve_simulated([e], solution=one, update=True)
+    row("6 x 1", one, 6, time.perf_counter() - start)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=40, help="of each kind for each seed")
@@ -124,7 +264,17 @@ def main():
     parser.add_argument("--turbulence", type=float, default=0.0, metavar="PX",
                         help="rms of waves that differ between exposures")  # fmt: skip
     parser.add_argument("--cells", action="store_true", help="show what false alarms consist of")
+    parser.add_argument("--update", action="store_true",
+                        help="how well --update follows a wave, no laboratory")  # fmt: skip
+    parser.add_argument("--update-alarms", action="store_true",
+                        help="how often --update moves a camera that has not changed")  # fmt: skip
     options = parser.parse_args()
+    if options.update:
+        updates(options)
+        return
+    if options.update_alarms:
+        false_alarms(options)
+        return
     find_lab()
     print(f"{'case':13s} {'stored':>6s} {'tested':>6s}  {'change':9s} {'trials':>6s} "
           f"{'alarms':>7s} {'area':>5s} {'false':>6s} "

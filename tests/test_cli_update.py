@@ -127,4 +127,94 @@ def test_what_is_no_solution_is_refused(inputs, updated, tmp_path, capsys):
     assert run([*command, "--solution", str(wrong), "--update"]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
-    assert "--solution needs a *.solution.asdf file" in lines[0]
+    assert "--solution needs a *.solution.asdf or *.camera.asdf file" in lines[0]
+
+
+@pytest.fixture(scope="module")
+def later(tmp_path_factory):
+    """Frames of two years later, when the distortion has grown by 3 %."""
+    folder = tmp_path_factory.mktemp("later")
+    grown = simulate(
+        3, image_shape=SHAPE, density=40, distortion=20.6, seed=8, epoch=[2018.5, 2018.6, 2018.7]
+    )
+    files = write_simulation(grown, folder, images=(), sources="ldac")
+    return [str(f) for f in files["frames"]], str(files["reference"])
+
+
+@pytest.fixture(scope="module")
+def followed(halves, later, tmp_path_factory):
+    frames, reference = later
+    folder = tmp_path_factory.mktemp("followed")
+    status = run(
+        ["calibrate", *frames, "--catalog", reference, "--output", str(folder),
+         "--solution", str(halves[0]), "--update"]
+    )  # fmt: skip
+    assert status == 0
+    return folder
+
+
+def test_a_change_is_told_and_dated(halves, followed):
+    old, new = read(halves[0]), read(followed / "sim.solution.asdf")
+    (entry,) = new.statistics["updates"]
+    assert entry["process_noise"] > 0
+    assert entry["evidence"] > 3
+    assert 0.01 < entry["rms_change_px"] < entry["max_change_px"] < 1
+    assert abs(entry["first_epoch"] - 2018.5) < 0.01
+    assert abs(entry["last_epoch"] - 2018.7) < 0.01
+    assert new.valid_from == entry["first_epoch"]
+    assert new.valid_to is None
+    (kept,) = followed.glob("*.until-*.solution.asdf")
+    assert kept.name == f"sim.until-{new.valid_from:.4f}.solution.asdf"
+    kept = read(kept)
+    assert (kept.valid_from, kept.valid_to) == (None, new.valid_from)
+    assert kept.residual_map == old.residual_map
+    assert new.provenance["epochs"] == [2016.0, entry["last_epoch"]] or (
+        abs(new.provenance["epochs"][0] - 2016.0) < 0.01
+    )
+    assert len(new.provenance["inputs"]) == 6
+
+
+def test_the_command_line_says_what_has_changed(halves, inputs, later, tmp_path, capsys):
+    for (frames, reference), words in (
+        (later, ("sim: changed before 2018.", "px rms", "the old solution is in sim.until-2018.")),
+        ((inputs[0][3:], inputs[1]), ("sim: no change found, 3 exposures added",)),
+    ):
+        status = run(
+            ["calibrate", *frames, "--catalog", reference, "--output", str(tmp_path),
+             "--solution", str(halves[0]), "--update", "--overwrite"]
+        )  # fmt: skip
+        assert status == 0
+        output = capsys.readouterr().out
+        assert all(word in output for word in words), output
+
+
+def test_monitor_sees_what_the_update_has_seen(halves, inputs, later, tmp_path):
+    for name, (frames, reference), status in (
+        ("same", (inputs[0][3:], inputs[1]), 0),
+        ("other", later, 1),
+    ):
+        folder = tmp_path / name
+        command = ["calibrate", *frames, "--catalog", reference, "--output", str(folder), "-q"]
+        assert run([*command, "--solution", str(halves[0]), "--refine", "attitude"]) == 0
+        assert run(["monitor", str(halves[0]), str(folder), "-q"]) == status
+
+
+def test_a_solution_of_another_time_is_a_shortcoming(inputs, followed, tmp_path, capsys):
+    frames, reference = inputs
+    command = ["calibrate", frames[0], "--catalog", reference, "--output", str(tmp_path), "-q",
+               "--solution", str(followed / "sim.solution.asdf")]  # fmt: skip
+    assert run(command) == 0
+    summary = Table.read(tmp_path / "summary.ecsv")
+    assert list(summary["status"]) == ["degraded"]
+    assert "the stored solution is valid from 2018." in summary["reason"][0]
+    # Nor can they update it.
+    capsys.readouterr()
+    assert run([*command, "--update", "--overwrite"]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "it cannot be updated with it" in line
+
+
+def test_report_shows_the_solution_that_holds(followed):
+    pytest.importorskip("jinja2")
+    assert run(["report", str(followed), "--output", str(followed / "page.html"), "-q"]) == 0
+    assert (followed / "page.html").stat().st_size > 1000

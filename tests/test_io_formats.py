@@ -202,7 +202,7 @@ def edited(path, tmp_path, edit):
         ("format_version", "1.2.0", "must not be newer than 1.1.0, got 1.2.0"),
         ("format_version", "2.0.0", "must not be newer than 1.1.0, got 2.0.0"),
         ("format_version", "new", "must be like '1.1.0', got 'new'"),
-        ("kind", "map", "must be 'solution' or 'calibration', got 'map'"),
+        ("kind", "map", "must be 'solution', 'calibration' or 'camera', got 'map'"),
         ("cd", [[1.0, 2.0]], r"cd must be finite and of the shape \(2, 2\)"),
         ("crval", [1.0, float("nan")], "crval must be finite"),
         ("solution", None, "damaged 'wpdc' tree"),

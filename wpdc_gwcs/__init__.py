@@ -21,6 +21,7 @@ _PUBLIC = {
     "sky_map": "wcs",
     "DistortionSolution": "solution",
     "Calibration": "solution",
+    "Camera": "camera",
     "calibrate": "calibration",
     "Settings": "calibration",
     "evaluate": "evaluation",

@@ -47,6 +47,9 @@ class DistortionSolution:
         Binned residuals behind the table, to which those of other frames can be added.
     statistics, settings, provenance : dict
         How the solution came about.
+    valid_from, valid_to : float, optional
+        Epochs, Julian years, from which on and before which the solution holds; `None` for no limit
+        that is known.
     """
 
     detector: str
@@ -61,6 +64,36 @@ class DistortionSolution:
     statistics: dict = dataclasses.field(default_factory=dict)
     settings: dict = dataclasses.field(default_factory=dict)
     provenance: dict = dataclasses.field(default_factory=dict)
+    valid_from: float | None = None
+    valid_to: float | None = None
+
+    def holds_at(self, epoch):
+        """Tell whether the solution is valid at an epoch.
+
+        Parameters
+        ----------
+        epoch : float or None
+            Julian year; unknown epochs are let pass.
+
+        Returns
+        -------
+        bool
+            From ``valid_from`` on and before ``valid_to``.
+        """
+        if epoch is None:
+            return True
+        since = self.valid_from is None or epoch >= self.valid_from
+        return since and (self.valid_to is None or epoch < self.valid_to)
+
+    @property
+    def validity(self):
+        """Validity in words, for messages."""
+        parts = [
+            f"{word} {value:.4f}"
+            for word, value in (("from", self.valid_from), ("until", self.valid_to))
+            if value is not None
+        ]
+        return " ".join(parts) or "always"
 
     @cached_property
     def wcs(self):

@@ -1,5 +1,6 @@
 """All frames of one camera, solved together: its detectors, and what is each exposure's own."""
 
+import logging
 import time
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -25,6 +26,8 @@ from wpdc_gwcs.solution import Calibration
 from wpdc_gwcs.solve import Exposure, solve
 
 __all__ = ["cameras_of", "solve_camera"]
+
+log = logging.getLogger(__name__)
 
 # The solution is repeated with fresh pairs if more than this share of them changes.
 _MAX_REMATCH = 3
@@ -100,6 +103,8 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
     solution = solution or {}
     failures = {}
     group = _of_one_shape(group, failures)
+    if update:
+        group = _of_valid_epoch(group, solution, failures)
     began = time.perf_counter()
     shapes = {frame.detector: tuple(frame.image_shape) for frame in group}
     crpix = {}
@@ -164,15 +169,14 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
                     crpix=crpix[frame.detector], cd=fit.cd, crval=fit.crval
                 )
     seconds = (time.perf_counter() - began) / len(group)
-    solutions = {
-        name: replace(
-            one,
-            provenance={
-                **one.provenance, **_provenance([f for f in group if f.detector == name])
-            },
+    solutions = {}
+    for name, one in result.solutions.items():
+        own = [f for f in group if f.detector == name and f.name not in result.rejected]
+        if update and name in solution:
+            one = _dated(one, own, solution[name])
+        solutions[name] = replace(
+            one, provenance=_provenance(own, one.provenance if update else {})
         )
-        for name, one in result.solutions.items()
-    }  # fmt: skip
     result = replace(result, solutions=solutions)
     calibrations = []
     for frame, found, fit in zip(group, pairs, result.exposures, strict=True):
@@ -195,6 +199,42 @@ def _weights(settings, shapes):
     if settings.lut == "none" and settings.weight == Settings.weight:
         return None
     return {name: settings.radial_weight(shape) for name, shape in shapes.items()}
+
+
+def _of_valid_epoch(group, solution, failures):
+    """Frames of the time for which the stored solutions hold; the others cannot update them."""
+    for frame in group:
+        stored = solution.get(frame.detector)
+        if stored is not None and not stored.holds_at(frame.epoch):
+            failures[frame.name] = FitError(
+                f"{frame.source}: the frame is of {frame.epoch:.4f}, the stored solution is valid "
+                f"{stored.validity}: it cannot be updated with it"
+            )
+    return [frame for frame in group if frame.name not in failures]
+
+
+def _dated(solution, frames, stored):
+    """Tell the epochs of an update; a changed solution is valid from the first."""
+    *before, last = solution.statistics["updates"]
+    epochs = [f.epoch for f in frames if f.epoch is not None]
+    first, final = (min(epochs), max(epochs)) if epochs else (None, None)
+    last = {"first_epoch": first, "last_epoch": final, **last}
+    statistics = {**solution.statistics, "updates": [*before, last]}
+    solution = replace(solution, statistics=statistics)
+    if last["process_noise"] == 0:
+        return solution
+    log.info(
+        "detector %s has changed by %.3g px rms, %.3g px at most (log evidence %.1f)",
+        solution.detector, last["rms_change_px"], last["max_change_px"], last["evidence"],
+    )  # fmt: skip
+    earlier = stored.provenance.get("epochs") or []
+    if first is None or (earlier and first <= earlier[1]):
+        log.warning(
+            "detector %s: no epoch tells the stored solution from the changed one: neither gets "
+            "a validity", solution.detector,
+        )  # fmt: skip
+        return solution
+    return replace(solution, valid_from=first)
 
 
 def _of_one_shape(group, failures):
@@ -410,19 +450,24 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
     )  # fmt: skip
     known = stored is not None or len(result.solutions) > 1
     check_solution(frame, calibration, stored=stored, known=known)
-    reasons = shortcomings(frame, calibration, held=held, known=known)
+    reasons = shortcomings(frame, calibration, held=held, known=known, stored=stored)
     statistics["status"] = "degraded" if reasons else "solved"
     statistics["reasons"] = reasons
     return calibration
 
 
-def _provenance(group):
+def _provenance(group, before=None):
+    """Versions, inputs and epochs of frames, those of a stored solution included."""
+    before = before or {}
+    epochs = [*(before.get("epochs") or []), *(f.epoch for f in group if f.epoch is not None)]
     return {
+        **before,
         "software": {
             "wpdc_gwcs": version("wpdc_gwcs"),
             "numpy": version("numpy"),
             "astropy": version("astropy"),
         },
-        "inputs": [frame.source for frame in group],
+        "inputs": [*before.get("inputs", []), *(frame.source for frame in group)],
+        "epochs": [min(epochs), max(epochs)] if epochs else None,
         "created": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
     }

@@ -96,7 +96,7 @@ def check_solution(frame, calibration, *, stored=None, known=False):
         )
 
 
-def shortcomings(frame, calibration, *, held, known=False):
+def shortcomings(frame, calibration, *, held, known=False, stored=None):
     """List what a delivered solution lacks.
 
     Parameters
@@ -109,6 +109,8 @@ def shortcomings(frame, calibration, *, held, known=False):
         Matches that were held out on purpose.
     known : bool, optional
         Whether other detectors or a stored solution know the distortion.
+    stored : DistortionSolution, optional
+        The stored solution that was used.
 
     Returns
     -------
@@ -141,6 +143,10 @@ def shortcomings(frame, calibration, *, held, known=False):
     n = int(np.sum(~held))
     if used.sum() < _MIN_USED * n:
         reasons.append(f"{used.sum()} of {n} matched stars agree with the solution")
+    if stored is not None and not stored.holds_at(frame.epoch):
+        reasons.append(
+            f"the stored solution is valid {stored.validity}, the frame is of {frame.epoch:.4f}"
+        )
     match = frame.diagnostics
     if match.completeness < _MIN_COMPLETENESS:
         reasons.append(

@@ -16,6 +16,7 @@ from wpdc_gwcs.calibration.exposures import tie_exposures
 from wpdc_gwcs.calibration.matched import FailedFrame, match_frame, measure_sources
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.settings import Settings
+from wpdc_gwcs.camera import build_camera
 from wpdc_gwcs.catalogs import fill_motions
 from wpdc_gwcs.exceptions import FitError, MatchError, WPDCError
 from wpdc_gwcs.frame import Frame
@@ -38,12 +39,18 @@ class CalibrationRun:
         Frame name to the error that kept it from being solved.
     summary : `~astropy.table.QTable`
         One row per frame: status, reason, counts, residual statistics, seconds.
+    superseded : dict
+        Detector name to the stored solution that an update has found changed, valid until then.
+    cameras : list of `Camera`
+        One for each group of detectors that were solved together.
     """
 
     calibrations: list
     solutions: dict
     failures: dict
     summary: QTable = field(repr=False)
+    superseded: dict = field(default_factory=dict)
+    cameras: list = field(default_factory=list)
 
 
 @one_blas_thread
@@ -66,10 +73,12 @@ def calibrate(
         What `wpdc_gwcs.io.read_frames` returns; names must be unique.
     catalog : `~astropy.table.Table`
         Reference catalogue as returned by `read_catalog`.
-    solution : DistortionSolution or mapping, optional
-        Stored solution (or detector name to solution): only the attitudes of the frames are fitted.
+    solution : DistortionSolution, Camera or mapping, optional
+        Stored solution (of a camera, or detector name to solution): only the attitudes of the
+        frames are fitted.
     update : bool, optional
-        Merge the new frames into the stored solution instead of keeping it fixed.
+        Merge the new frames into the stored solution, and let it follow a change, instead of
+        keeping it fixed.
     settings : Settings, optional
         Choices; the defaults work for any camera.
     jobs : int, optional
@@ -114,12 +123,15 @@ def calibrate(
     catalog = fill_motions(catalog)
     frames = tie_exposures(frames)
 
+    solution = getattr(solution, "solutions", solution)
     common = {"catalog": catalog, "solution": solution, "settings": settings}
-    results = _match_exposures(frames, common, jobs, executor, progress)
+    results = _of_other_detectors(frames, solution)
+    if not results:
+        results = _match_exposures(frames, common, jobs, executor, progress)
     failures = {n: r.error for n, r in results.items() if isinstance(r, FailedFrame)}
     matched = [r for r in results.values() if not isinstance(r, FailedFrame)]
 
-    solutions, calibrations = {}, {}
+    solutions, calibrations, superseded, cameras = {}, {}, {}, []
     groups = cameras_of(matched)
     holdout = _holdout_mask(catalog, settings)
     for k, group in enumerate(groups):
@@ -133,12 +145,51 @@ def calibrate(
             group, settings, holdout=holdout, solution=stored, update=update
         )
         solutions |= solved
+        for name, one in solved.items():
+            if name in stored and one.valid_from != stored[name].valid_from:
+                superseded[name] = replace(stored[name], valid_to=one.valid_from)
+        if len(solved) > 1:
+            cameras.append(_camera_of(group, solved, found))
         calibrations.update({c.frame: c for c in found})
         failures.update(failed)
     progress("solve", len(groups), len(groups))
     ordered = [calibrations[n] for n in names if n in calibrations]
     summary = _summarize(frames, results, calibrations, failures)
-    return CalibrationRun(ordered, solutions, failures, summary)
+    return CalibrationRun(ordered, solutions, failures, summary, superseded, cameras)
+
+
+# Detectors named in a message.
+_MOST_NAMED = 6
+
+
+def _of_other_detectors(frames, solution):
+    """Fail all frames if not one of the stored solutions is of a detector of theirs."""
+    if not isinstance(solution, Mapping) or {f.detector for f in frames} & set(solution):
+        return {}
+    names = [repr(name) for name in solution]
+    named = ", ".join(names[:_MOST_NAMED]) + ", ..." * (len(names) > _MOST_NAMED)
+    return {
+        f.name: FailedFrame(
+            FitError(
+                f"{f.source}: the frame is of detector {f.detector!r}, the stored solutions are of "
+                f"{named or 'none'}"
+            ),
+            0,
+            0.0,
+        )
+        for f in frames
+    }
+
+
+def _camera_of(group, solutions, calibrations):
+    """Camera of the detectors of a group, by the exposures that they share."""
+    exposures = {}
+    frames = {f.name: f for f in group}
+    for c in calibrations:
+        exposures.setdefault(frames[c.frame].exposure or c.frame, []).append(c)
+    name = next((f.camera for f in group if f.camera), "camera")
+    first = next(iter(solutions.values()))
+    return build_camera(name, list(exposures.values()), solutions, provenance=first.provenance)
 
 
 def _match_exposures(frames, common, jobs, executor, progress):

@@ -4,6 +4,7 @@ import logging
 import os
 import tempfile
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -75,13 +76,20 @@ def calibrate_command(
         typer.Option("--no-camera", help="Detectors of one exposure know nothing of each other."),
     ] = False,
     solution: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
-            metavar="FILE", help="Stored *.solution.asdf: fit only the attitude of each frame."
+            metavar="FILE",
+            help="Stored *.solution.asdf (once for each detector) or *.camera.asdf: fit only the "
+            "attitude of each frame.",
         ),
     ] = None,
     update: Annotated[
-        bool, typer.Option("--update", help="Merge the frames into the stored solution.")
+        bool,
+        typer.Option(
+            "--update",
+            help="Merge the frames into the stored solution, which follows a change that they "
+            "show.",
+        ),
     ] = False,
     refine: Annotated[
         str,
@@ -171,18 +179,18 @@ def calibrate_command(
     """Calibrate frames: detect, match, fit and write one WCS file each.
 
     Writes STEM.wcs.asdf and STEM.matches.ecsv for each solved frame (and STEM.sources.ecsv for
-    images), DETECTOR.solution.asdf for each detector, and summary.ecsv.  A frame that lacks
-    something is delivered as degraded, and the summary says what.  Exit status 1 if a frame
-    was not solved: it has no WCS file, and its row of the summary says why.
+    images), DETECTOR.solution.asdf for each detector, CAMERA.camera.asdf for detectors that were
+    solved together, and summary.ecsv.  A frame that lacks something is delivered as degraded, and
+    the summary says what.  Exit status 1 if a frame was not solved: it has no WCS file, and its row
+    of the summary says why.
     """
     from wpdc_gwcs.calibration import Settings, calibrate
     from wpdc_gwcs.catalogs import read_catalog
-    from wpdc_gwcs.io import read, read_frames
-    from wpdc_gwcs.solution import DistortionSolution
+    from wpdc_gwcs.io import read_frames
 
     if report:
         require_plotting("--report")
-    if update and solution is None:
+    if update and not solution:
         raise InputError("--update needs the stored solution: --solution FILE")
     if no_camera and exposure_key is not None:
         raise InputError("--exposure-key ties detectors together, --no-camera keeps them apart")
@@ -213,11 +221,7 @@ def calibrate_command(
     if report:
         results.require_free("report.html")
     reference = read_catalog(catalog)
-    stored = None
-    if solution is not None:
-        stored = read(solution)
-        if not isinstance(stored, DistortionSolution):
-            raise InputError(f"{solution}: --solution needs a *.solution.asdf file")
+    stored = stored_solutions(solution or [])
     with executor(scheduler) as pool, progress_bar(quiet=quiet) as progress:
         run = calibrate(
             loaded,
@@ -235,6 +239,8 @@ def calibrate_command(
         write_page(run.summary, run.solutions, tables, output / "report.html", overwrite=overwrite)
     if not quiet:
         print_summary(run, output)
+        if update:
+            print_changes(run)
     for calibration in run.calibrations:
         if calibration.statistics["reasons"]:
             log.warning(
@@ -274,6 +280,44 @@ def write_page(summary, solutions, matches, path, *, overwrite):
         write_report(summary, solutions, matches, file)
 
 
+def stored_solutions(paths):
+    """Read the files of ``--solution``.
+
+    Parameters
+    ----------
+    paths : list of Path
+        Solutions and cameras.
+
+    Returns
+    -------
+    DistortionSolution or dict or None
+        A single solution as it is, several by their detectors, `None` without files.
+    """
+    from wpdc_gwcs.camera import Camera
+    from wpdc_gwcs.io import read
+    from wpdc_gwcs.solution import DistortionSolution
+
+    found, source = {}, {}
+    single = None
+    for path in paths:
+        stored = read(path)
+        if isinstance(stored, DistortionSolution):
+            single, several = stored, {stored.detector: stored}
+        elif isinstance(stored, Camera):
+            several = stored.solutions
+        else:
+            raise InputError(f"{path}: --solution needs a *.solution.asdf or *.camera.asdf file")
+        for name, one in several.items():
+            if name in found:
+                raise InputError(
+                    f"{path}: detector {name!r} has a solution in {source[name]} already"
+                )
+            found[name], source[name] = one, path
+    if not found:
+        return None
+    return single if len(paths) == 1 and single is not None else found
+
+
 class Results:
     """Files of one calibration: checked before the work begins, written after it.
 
@@ -297,6 +341,10 @@ class Results:
                 self.require_free(frame.name + suffix)
         for detector in {frame.detector for frame in frames}:
             self.require_free(f"{file_stem(detector)}.solution.asdf")
+        cameras = {frame.camera for frame in frames if frame.camera}
+        for camera in cameras:
+            if len({frame.detector for frame in frames if frame.camera == camera}) > 1:
+                self.require_free(f"{file_stem(camera)}.camera.asdf")
         self.require_free("summary.ecsv")
 
     @staticmethod
@@ -361,7 +409,59 @@ class Results:
                 self.folder / f"{file_stem(detector)}.solution.asdf",
                 overwrite=self.overwrite,
             )
+        for solution in run.superseded.values():
+            write(solution, self.folder / superseded_name(solution), overwrite=self.overwrite)
+        for camera in run.cameras:
+            files = {d: f"{file_stem(d)}.solution.asdf" for d in camera.detectors}
+            write(
+                replace(camera, files=files),
+                self.folder / f"{file_stem(camera.name)}.camera.asdf",
+                overwrite=self.overwrite,
+            )
         write_table(run.summary, self.folder / "summary.ecsv", overwrite=self.overwrite)
+
+
+def superseded_name(solution):
+    """Name of the file of a solution that no longer holds.
+
+    Parameters
+    ----------
+    solution : DistortionSolution
+        With the epoch until which it was valid.
+
+    Returns
+    -------
+    str
+        Such as ``ccd1.until-2024.5000.solution.asdf``.
+    """
+    return f"{file_stem(solution.detector)}.until-{solution.valid_to:.4f}.solution.asdf"
+
+
+def print_changes(run):
+    """Print what an update has changed.
+
+    Parameters
+    ----------
+    run : CalibrationRun
+        What was found.
+    """
+    for name, solution in run.solutions.items():
+        if not solution.statistics.get("updates"):
+            continue
+        last = solution.statistics["updates"][-1]
+        exposures = f"{last['n_exposures']} exposures"
+        if last["process_noise"] == 0:
+            typer.echo(f"{name}: no change found, {exposures} added")
+            continue
+        since = "" if last.get("first_epoch") is None else f" before {last['first_epoch']:.4f},"
+        kept = ""
+        if name in run.superseded:
+            kept = f"; the old solution is in {superseded_name(run.superseded[name])}"
+        typer.echo(
+            f"{name}: changed{since} by {last['rms_change_px']:.4f} px rms, "
+            f"{last['max_change_px']:.4f} px at most ({exposures}, log evidence "
+            f"{last['evidence']:.1f}){kept}"
+        )
 
 
 def file_stem(detector):

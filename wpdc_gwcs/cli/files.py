@@ -46,15 +46,40 @@ def export_command(
     quiet: Quiet = False,
 ):
     """Write a calibrated WCS in a format that other programs read; say how far it deviates."""
-    from wpdc_gwcs.io import read, write
+    from wpdc_gwcs.io import write
 
     if format not in FORMATS:
         raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
     require_free(output, overwrite)
-    deviation = write(read(file), output, format=format, overwrite=overwrite)
+    deviation = write(read_one(file), output, format=format, overwrite=overwrite)
     if not quiet:
         note = "" if deviation is None else f" (greatest deviation {deviation:.2g} px)"
         typer.echo(f"{output}: written as {format}{note}")
+
+
+def read_one(file):
+    """Read a file that has one WCS.
+
+    Parameters
+    ----------
+    file : Path
+        Of a frame or of a detector.
+
+    Returns
+    -------
+    Calibration or DistortionSolution
+        What is in it; a camera is refused.
+    """
+    from wpdc_gwcs.camera import Camera
+    from wpdc_gwcs.io import read
+
+    found = read(file)
+    if isinstance(found, Camera):
+        raise InputError(
+            f"{file}: is a camera of {len(found.detectors)} detectors; name the file of one, for "
+            f"example {file.parent / found.files[found.reference]}"
+        )
+    return found
 
 
 @app.command("pix2sky", no_args_is_help=True, context_settings={"ignore_unknown_options": True})
@@ -90,11 +115,9 @@ def sky2pix_command(
 
 
 def _transform(file, points, origin, output, overwrite, *, forward):
-    from wpdc_gwcs.io import read
-
     if origin not in (0, 1):
         raise InputError(f"--origin must be 0 or 1, got {origin}")
-    wcs = read(file).wcs
+    wcs = read_one(file).wcs
     names = ("x", "y", "ra", "dec") if forward else ("ra", "dec", "x", "y")
 
     def transform(a, b):
@@ -417,6 +440,8 @@ def report_command(
         for name in summary["frame"][summary["status"] == "solved"]
     }
     found = [read(path) for path in sorted(folder.glob("*.solution.asdf"))]
+    # What an update has superseded lies beside what is valid now.
+    found.sort(key=lambda solution: solution.valid_to is None)
     write_page(summary, {s.detector: s for s in found}, tables, output, overwrite=overwrite)
     if not quiet:
         typer.echo(f"{output}: report of {len(summary)} frames")

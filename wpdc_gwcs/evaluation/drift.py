@@ -106,7 +106,7 @@ def detect_drift(solution, matches, *, false_alarm=0.01):
     1. The residuals are averaged in 2 x 2 to 16 x 16 cells.  Their variance is that of the stars'
        errors, scaled to the observed scatter and, with several frames, to the scatter of the means
        from frame to frame (turbulence is common to the stars of one cell), and that of the
-       solution.
+       solution; a single frame may differ by as much as those behind the solution did.
     2. The most significant cell, its probability multiplied by the number of cells (Bonferroni,
        which holds whatever the correlation between cells), and the chi-square of the whole
        detector, with the correlation of the table's errors, have half of the false alarms each.
@@ -238,7 +238,11 @@ class _Stars:
         variance = variance.reshape(2, n_grid, 3, n_grid, 3).mean(axis=(2, 4)).reshape(2, -1)
         freedom = self.solution.statistics.get("table", {}).get("freedom") or 0.0
         share = min(1.0, n_grid**2 / freedom) if freedom else 1.0
-        return variance * share * _TABLE_MARGIN**2
+        variance = variance * share
+        if self.n_frames == 1:
+            # Several frames show by their differences what is their own.
+            variance = variance + _field_variance(self.solution)
+        return variance * _TABLE_MARGIN**2
 
     def _inflation(self, cell, rows, residual, weight, mean, m):
         """How much more the means of frames scatter than the errors of their stars, at least 1.
@@ -258,6 +262,18 @@ class _Stars:
             excess += np.sum(np.where(there, total * (own - mean_of) ** 2, 0.0))
             freedom += there.sum() - there.any(axis=0).sum() - 3 * (self.n_frames - 1)
         return max(1.0, excess / freedom) if freedom > 0 else 1.0
+
+
+def _field_variance(solution):
+    """Variance along each axis that a frame of itself brings, what attitudes take left out, px^2.
+
+    A von Karman spectrum, without the waves that are longer than the detector.
+    """
+    fields = solution.statistics.get("fields")
+    if not fields:
+        return 0.0
+    lowest = (0.5 * fields["scale"] / max(solution.image_shape)) ** 2
+    return fields["amplitude"] ** 2 * (1 + lowest) ** (-5 / 6)
 
 
 @dataclass(frozen=True, eq=False)

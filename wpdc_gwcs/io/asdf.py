@@ -9,7 +9,7 @@ Layout of ``wpdc``, format version 1.1.0 (arrays are core ASDF arrays, all else 
 
 ======================= ========================================================================
 ``format_version``      "1.1.0"
-``kind``                "solution" or "calibration"
+``kind``                "solution", "calibration" or "camera"
 ``software``            name and version of the writer
 ``solution``            the instrument, see below
 ``frame``               of a calibration: name of the frame, and with it ``crval``, ``cd``,
@@ -21,8 +21,11 @@ Layout of ``wpdc``, format version 1.1.0 (arrays are core ASDF arrays, all else 
 ``solution`` has ``detector``, ``image_shape`` (ny, nx), ``crpix`` (zero based), ``cd``, ``crval``,
 ``pv`` (``degree``, ``radial``, ``indices``, ``coefficients``), ``lookup_table`` (``method``,
 ``x_grid``, ``y_grid``, ``dx``, ``dy``) or null, ``table_sigma``, ``residual_map`` (solution files
-only), ``statistics``, ``settings``, ``provenance``.  Matches and sources have tables of their own.
-Files of version 1.0.0 open; the uncertainties of their frames are not known any more.
+only), ``statistics``, ``settings``, ``provenance``, ``valid_from``, ``valid_to``.  A camera has no
+``wcs``; it has ``name``, ``detectors``, ``reference``, ``places``, ``matrices``, ``image_shapes``,
+``cd``, ``learned``, ``files`` (detector to solution file beside it) and ``provenance``.  Matches
+and sources have tables of their own.  Files of version 1.0.0 open; the uncertainties of their
+frames are not known any more.
 """
 
 import dataclasses
@@ -33,6 +36,7 @@ from pathlib import Path
 import asdf
 import numpy as np
 
+from wpdc_gwcs.camera import Camera
 from wpdc_gwcs.exceptions import FileFormatError, InputError
 from wpdc_gwcs.io.files import READ_ERRORS, atomic_path, first_line
 from wpdc_gwcs.lookup import ResidualMap
@@ -53,18 +57,29 @@ def write_asdf(obj, path, *, overwrite=False):
 
     Parameters
     ----------
-    obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
-        What to write.
+    obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or `~wpdc_gwcs.Camera`
+        What to write; of a camera not the solutions, which have files of their own.
     path : path-like
         File to write.
     overwrite : bool, optional
         Whether an existing file may be replaced.
+
+    Raises
+    ------
+    InputError
+        If a camera does not name the files of its solutions.
     """
     from wpdc_gwcs import __version__
     from wpdc_gwcs.wcs import to_stock_wcs
 
     tree = {"format_version": FORMAT_VERSION}
     software = {"name": "wpdc_gwcs", "version": __version__}
+    if isinstance(obj, Camera):
+        if set(obj.files) != set(obj.detectors):
+            raise InputError(f"{path}: a camera must name the solution file of each detector")
+        tree |= {"kind": "camera", "software": software, **_fields_of(obj, {"solutions"})}
+        _write_tree({"wpdc": tree}, path, overwrite)
+        return
     if isinstance(obj, Calibration):
         tree |= {"kind": "calibration", "software": software, **_fields_of(obj, _NOT_STORED)}
     else:
@@ -111,8 +126,9 @@ def read_asdf(path):
 
     Returns
     -------
-    obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
-        As written, with the fast WCS; without matches and sources.
+    obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or `~wpdc_gwcs.Camera`
+        As written, with the fast WCS; without matches and sources.  A camera comes with the
+        solutions in the files that it names.
 
     Raises
     ------
@@ -129,9 +145,13 @@ def read_asdf(path):
         raise FileFormatError(f"{path}: must have a 'wpdc' tree, has none: not a wpdc_gwcs file")
     _check_version(tree, path)
     kind = tree.get("kind")
-    if kind not in ("solution", "calibration"):
-        raise FileFormatError(f"{path}: kind must be 'solution' or 'calibration', got {kind!r}")
+    if kind not in ("solution", "calibration", "camera"):
+        raise FileFormatError(
+            f"{path}: kind must be 'solution', 'calibration' or 'camera', got {kind!r}"
+        )
     try:
+        if kind == "camera":
+            return _read_camera(tree, path)
         solution = _object_of(DistortionSolution, _entry(tree, "solution", path), path)
         if kind == "solution":
             return solution
@@ -140,6 +160,30 @@ def read_asdf(path):
         raise
     except READ_ERRORS as problem:
         raise FileFormatError(f"{path}: damaged 'wpdc' tree: {first_line(problem)}") from problem
+
+
+def _read_camera(tree, path):
+    camera = _object_of(Camera, {**tree, "solutions": {}}, path)
+    solutions = {}
+    n = len(camera.detectors)
+    if set(camera.files) != set(camera.detectors) or not (
+        len(camera.places) == len(camera.matrices) == len(camera.image_shapes) == n
+    ):
+        raise FileFormatError(f"{path}: must have a place, a shape and a file for each detector")
+    for name, shape in zip(camera.detectors, camera.image_shapes):
+        file = Path(path).parent / camera.files[name]
+        if not file.is_file():
+            raise FileFormatError(f"{path}: the file of detector {name!r} is missing: {file}")
+        one = read_asdf(file)
+        if not isinstance(one, DistortionSolution) or one.detector != name:
+            raise FileFormatError(f"{path}: {file} is not the solution of detector {name!r}")
+        if tuple(one.image_shape) != tuple(shape):
+            raise FileFormatError(
+                f"{path}: {file} is of shape (ny, nx) {tuple(one.image_shape)}, the camera's "
+                f"detector {name!r} of {tuple(int(v) for v in shape)}"
+            )
+        solutions[name] = one
+    return dataclasses.replace(camera, solutions=solutions)
 
 
 def read_asdf_wcs(path):
@@ -307,5 +351,9 @@ _READERS = {
     "lookup_table": _read_table,
     "field": _read_table,
     "residual_map": ResidualMap.from_tree,
+    "detectors": tuple,
+    "places": lambda places: np.array(places, float).reshape(-1, 2),
+    "matrices": lambda matrices: np.array(matrices, float).reshape(-1, 2, 2),
+    "image_shapes": lambda shapes: np.array(shapes, int).reshape(-1, 2),
     "image_shape": lambda shape: tuple(int(n) for n in shape),
 }

@@ -5,6 +5,7 @@ from pathlib import Path
 from astropy.io import fits
 from astropy.table import Table
 
+from wpdc_gwcs.camera import Camera
 from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.files import check_output, file_kind, split_extension
 from wpdc_gwcs.io.headers import header_text, parse_tan, parse_wcs, read_headers
@@ -17,7 +18,7 @@ _SUFFIXES = {".asdf": "asdf", ".fits": "fits", ".fit": "fits", ".head": "head", 
 
 
 def read(path):
-    """Read a calibration or a distortion solution.
+    """Read a calibration, a distortion solution or a camera.
 
     Parameters
     ----------
@@ -27,8 +28,9 @@ def read(path):
 
     Returns
     -------
-    obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
-        With the fast, exactly invertible ``wcs``.
+    obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or `~wpdc_gwcs.Camera`
+        With the fast, exactly invertible ``wcs``; a camera with the solutions of its detectors,
+        whose files must be where it says.
 
     Raises
     ------
@@ -125,8 +127,9 @@ def write(obj, path, *, format=None, overwrite=False):
 
     Parameters
     ----------
-    obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or `~astropy.table.Table`
-        What to write; in FITS formats, a solution stands about its nominal pointing.
+    obj : Calibration, DistortionSolution, Camera or `~astropy.table.Table`
+        What to write; in FITS formats, a solution stands about its nominal pointing.  A camera is
+        written as ``asdf`` only.
     path : path-like
         File to write.
     format : {"asdf", "fits", "cpdis", "head", "sip", "stock"}, optional
@@ -167,6 +170,8 @@ def write(obj, path, *, format=None, overwrite=False):
         return write_table(obj, path, overwrite=overwrite)
     if format not in FORMATS:
         raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {format!r} for {path}")
+    if isinstance(obj, Camera) and format != "asdf":
+        raise ValueError(f"a camera is written as 'asdf', got the format {format!r} for {path}")
     # Before the work, not after.
     check_output(path, overwrite=overwrite)
     return _writer(format)(obj, path, overwrite=overwrite)

@@ -232,6 +232,46 @@ class ResidualMap:
         coarse.sums = moved.reshape(*s.shape[:2], ky, factor, kx, factor).sum((3, 5))
         return coarse
 
+    def displaced(self, dx, dy):
+        """Add a displacement of every bin to the residuals in it.
+
+        Parameters
+        ----------
+        dx, dy : (my, mx) array_like
+            Displacement at the centroid of each bin, px.
+
+        Returns
+        -------
+        ResidualMap
+            As if all stars of a bin had residuals larger by that.
+        """
+        dx, dy = np.asarray(dx, float), np.asarray(dy, float)
+        sums = self.sums.copy()
+        w, wx, wy = (self.sums[:, k] for k in (1, 7, 8))
+        sums[:, 7] += w * dx
+        sums[:, 8] += w * dy
+        sums[:, 9] += 2 * wx * dx + w * dx**2
+        sums[:, 10] += wx * dy + wy * dx + w * dx * dy
+        sums[:, 11] += 2 * wy * dy + w * dy**2
+        return ResidualMap(self.image_shape, sums)
+
+    def weighted(self, factor):
+        """Let the residuals count for less, or more.
+
+        Parameters
+        ----------
+        factor : float
+            Multiplies all weights, and divides the variances of all means; positive.
+
+        Returns
+        -------
+        ResidualMap
+            With the same number of stars.
+        """
+        sums = self.sums.copy()
+        sums[:, 1:] *= factor
+        return ResidualMap(self.image_shape, sums)
+
     def without(self, fold):
         """Leave one group out, for cross-validation.
 

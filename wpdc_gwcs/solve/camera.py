@@ -7,7 +7,6 @@ import numpy as np
 
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.fitting import RadialWeight
-from wpdc_gwcs.lookup import build_lookup_table, choose_table
 from wpdc_gwcs.solve import terms as make
 from wpdc_gwcs.solve.errors import worse_scatter
 from wpdc_gwcs.solve.exposure import SolveResult
@@ -29,7 +28,13 @@ from wpdc_gwcs.solve.state import (
     with_clipping,
     with_error_models,
 )
-from wpdc_gwcs.solve.stored import StoredMap
+from wpdc_gwcs.solve.stored import (
+    StoredMap,
+    find_change,
+    summarize_fields,
+    unswallowed_maps,
+    updated_solution,
+)
 from wpdc_gwcs.solve.tables import choose_tables, folds, residual_maps, with_tables
 
 __all__ = ["solve"]
@@ -239,7 +244,7 @@ def solve(
         state, infos = with_tables(o, state, group, n_grid, lut, choices=choices)
         state = _settled(o, state, clip, pool_attitudes)
     if update:
-        state, stored, infos = _updated(o, state, stored, group, n_grid)
+        state, stored, infos = _updated(o, state, stored, group, n_grid, refine == "field")
         state = _settled(o, state, clip, pool_attitudes)
     state = with_error_models(o, state)
     state = linear_step(o, state, learn=1, pool=pool_attitudes)
@@ -434,27 +439,30 @@ def _settled(o, state, clip, pool):
     return with_fields(o, state) if any(state.spectra.values()) else state
 
 
-def _updated(o, state, stored, group, n_grid):
-    """Merge the residuals of these exposures into stored solutions, and make tables anew."""
+def _updated(o, state, stored, group, n_grid, force):
+    """Let stored solutions follow what these exposures have in common, see `find_change`."""
     for name, solution in stored.items():
         if solution.residual_map is None:
             raise FitError(
                 f"the stored solution of {name!r} holds no residual map: it cannot be updated"
             )
-    maps = residual_maps(o, state, group, [stored[d.name].lookup_table for d in o.detectors])
+    bases = [stored[d.name].lookup_table for d in o.detectors]
+    found = {k: find_change(o, state, k, stored[d.name]) for k, d in enumerate(o.detectors)
+             if any(o.detector_of[f] == k for f in state.active)}  # fmt: skip
+    maps = unswallowed_maps(o, state, group, bases, {k: both[1] for k, both in found.items()})
     stored, infos, tables = dict(stored), [], []
-    for detector, new in zip(o.detectors, maps):
-        solution = stored[detector.name]
-        merged = solution.residual_map + new
-        choice, candidates = choose_table(merged)
-        table, info = build_lookup_table(merged, n_grid, choice=choice)
-        infos.append(replace(info, candidates=candidates))
-        solution = replace(
-            solution, lookup_table=table, table_sigma=info.sigma, residual_map=merged
-        )
+    for k, (detector, new) in enumerate(zip(o.detectors, maps)):
+        change = found[k][0] if k in found else None
+        solution, info = updated_solution(o, state, k, change, stored[detector.name], new, n_grid)
+        infos.append(info)
         stored[detector.name] = solution
         tables.append(StoredMap(solution))
-    return replace(state, model=state.model.changed(tables=tuple(tables))), stored, infos
+    model = state.model.changed(tables=tuple(tables), fields={})
+    state = replace(state, model=model)
+    if any(state.spectra.values()):
+        # What the fields had taken of a change is the instrument's now.
+        state = linear_step(o, with_spectra(o, state, force=force), learn=1)
+    return state, stored, infos
 
 
 def _result(o, state, stored, infos, group, settings, cd, update):
@@ -481,7 +489,10 @@ def _result(o, state, stored, infos, group, settings, cd, update):
         weight = weights[detector.name]
         solutions[detector.name] = replace(
             solution,
-            statistics={**solution.statistics, **_statistics(o, state, k, infos[k], solution)},
+            statistics={
+                **solution.statistics,
+                **_statistics(o, state, k, infos[k], solution, settings),
+            },
             settings={**settings, "weight": weight.name, "r0": float(weight.r0)},
         )
     residual = all_residuals(o, state)
@@ -527,7 +538,7 @@ def _with_maps(o, state, group, solutions):
     }
 
 
-def _statistics(o, state, k, info, solution):
+def _statistics(o, state, k, info, solution, settings):
     frames = [f for f in state.active if o.detector_of[f] == k]
     kept = int(sum(state.kept[o.slices[f]].sum() for f in frames))
     statistics = {"n_exposures": len(frames), "n_used": kept}
@@ -539,9 +550,16 @@ def _statistics(o, state, k, info, solution):
     statistics |= {
         "error_scale": first["scale"], "error_floor": first["floor"],
         "error_models": state.error_models,
-        "learned": {t.name: [float(v) for v in state.model.sigma[t.name]]
+        "learned": solution.statistics.get("learned", {})
+                 | {t.name: [float(v) for v in state.model.sigma[t.name]]
                     for t in state.model.terms if t.decay or t.chromatic},
     }  # fmt: skip
+    if settings["lut"] != "none" and settings["refine"] in ("auto", "field"):
+        statistics["fields"] = summarize_fields(
+            [state.spectrum(o, f) for f in frames],
+            solution.image_shape,
+            solution.statistics.get("fields"),
+        )
     if state.pooled:
         statistics["attitude_variation"] = state.pooled
     if info is not None:

@@ -1,0 +1,147 @@
+"""A camera: where its detectors stand in the focal plane, and the solution of each.
+
+::
+
+    detector px --[its solution]--> undistorted px --[place + matrix]--> focal plane px
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from wpdc_gwcs.models import deproject, project
+
+__all__ = ["Camera", "build_camera"]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Detectors that were solved together.
+
+    Parameters
+    ----------
+    name : str
+        Name of the camera.
+    detectors : tuple of str
+        Names of its detectors.
+    reference : str
+        The detector in whose undistorted px, from its reference point, the focal plane is.
+    places : (D, 2) ndarray
+        Reference point of each detector in the focal plane, px; tangent plane about that of
+        ``reference``.
+    matrices : (D, 2, 2) ndarray
+        Focal plane px per undistorted px of each detector.
+    image_shapes : (D, 2) ndarray of int
+        Shape ``(ny, nx)`` of each detector.
+    cd : (2, 2) ndarray
+        Nominal matrix of the reference, deg / px.
+    learned : dict
+        Standard deviations (px) of the terms of the model, as the stars told them.
+    files : dict
+        Detector to the file of its solution, relative to that of the camera.
+    solutions : dict
+        Detector to its `DistortionSolution`, in memory; in files of their own on disk.
+    provenance : dict
+        How the camera came about.
+    """
+
+    name: str
+    detectors: tuple
+    reference: str
+    places: np.ndarray
+    matrices: np.ndarray
+    image_shapes: np.ndarray
+    cd: np.ndarray
+    learned: dict = dataclasses.field(default_factory=dict)
+    files: dict = dataclasses.field(default_factory=dict)
+    solutions: dict = dataclasses.field(default_factory=dict, repr=False)
+    provenance: dict = dataclasses.field(default_factory=dict)
+
+    def focal_plane(self, detector, x, y):
+        """Focal plane position of pixels of a detector.
+
+        Parameters
+        ----------
+        detector : str
+            Name of the detector.
+        x, y : array_like
+            Detector pixels, zero based.
+
+        Returns
+        -------
+        x, y : ndarray
+            Focal plane, px; NaN off the detector.
+
+        Raises
+        ------
+        KeyError
+            If the camera has no such detector.
+        """
+        if detector not in self.detectors:
+            raise KeyError(f"camera {self.name!r} has no detector {detector!r}")
+        k = self.detectors.index(detector)
+        solution = self.solutions[detector]
+        ux, uy = solution.undistort(x, y)
+        offset = np.array([ux - solution.crpix[0], uy - solution.crpix[1]])
+        place = np.tensordot(self.matrices[k], offset, axes=1)
+        return tuple(p + q for p, q in zip(place, self.places[k]))
+
+
+def build_camera(name, exposures, solutions, *, provenance=None):
+    """Camera of the detectors of some calibrated exposures.
+
+    Parameters
+    ----------
+    name : str
+        Name of the camera.
+    exposures : sequence of list of Calibration
+        Frames of each exposure.
+    solutions : dict
+        Detector to its solution.
+    provenance : dict, optional
+        How it came about.
+
+    Returns
+    -------
+    Camera
+        With the mean places over the exposures; detectors that share none with the others, not
+        even by a third, are left out.
+    """
+    by_detector = [{c.solution.detector: c for c in frames} for frames in exposures]
+    names = [n for n in solutions if any(n in frames for frames in by_detector)]
+    partners = {n: sum(len(f) - 1 for f in by_detector if n in f) for n in names}
+    reference = max(names, key=partners.get)
+    found = {reference: (np.zeros(2), np.eye(2))}
+    waiting = [reference]
+    while waiting:
+        known = waiting.pop(0)
+        for n in names:
+            pairs = [_relative(f[known], f[n]) for f in by_detector if known in f and n in f]
+            if n in found or not pairs:
+                continue
+            place, matrix = (np.mean([p[i] for p in pairs], axis=0) for i in range(2))
+            base, turn = found[known]
+            found[n] = base + turn @ place, turn @ matrix
+            waiting.append(n)
+    kept = tuple(n for n in names if n in found)
+    return Camera(
+        name=name,
+        detectors=kept,
+        reference=reference,
+        places=np.array([found[n][0] for n in kept]),
+        matrices=np.array([found[n][1] for n in kept]),
+        image_shapes=np.array([solutions[n].image_shape for n in kept]),
+        cd=np.asarray(solutions[reference].cd, float),
+        learned=solutions[reference].statistics.get("learned", {}),
+        solutions={n: solutions[n] for n in kept},
+        provenance=provenance or {},
+    )
+
+
+def _relative(base, other):
+    """Give reference point and linear map of a frame in the undistorted px of another one."""
+    step = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    sky = deproject(*(np.asarray(other.cd) @ step), other.crval)
+    at = np.linalg.solve(base.cd, np.array(project(*sky, base.crval)))
+    return at[:, 0], at[:, 1:] - at[:, :1]
