@@ -47,9 +47,10 @@ _EXPOSURES_TRIED = 12
 _LOG_STRENGTH, _GUESS_WEIGHT = 1.0, 0.5
 _LEAST_STRENGTH = 0.1
 
-# The uncertainty of a stored map is itself an estimate, taken so many times larger (as in
-# `detect_drift`), and has as many parameters as a polynomial of degree 7 where it has no table.
-_STALE_MARGIN, _FREEDOM = 1.5, 36.0
+# The uncertainty of a stored map is itself an estimate: maps of a few turbulent exposures are wrong
+# by up to 1.7 times as much as they state, which is no change.  They have as many parameters as a
+# polynomial of degree 7 where there is no table.
+_STALE_MARGIN, _FREEDOM = 2.0, 36.0
 
 # Points along each axis on which a change is averaged.
 _POINTS = 24
@@ -193,7 +194,8 @@ def find_change(o, state, k, stored):
     field, change, gain = _spectra(products[::step], basis, prior, errors, scales, stale)
     found = gain > _AGAINST_CHANGE + _LEAST_GAIN
     broad = Spectrum(10 * max(errors, change.amplitude), change.scale)
-    one = _posterior(products, basis, field, stale + found * _power(change, basis))
+    power = stale + _power(change, basis) if found else stale / _STALE_MARGIN**2
+    one = _posterior(products, basis, field, power)
     variance = change.amplitude**2 if found else 0.0
     both = _posterior(products, basis, field, _power(broad, basis))
     return tuple(
@@ -498,8 +500,13 @@ def updated_solution(o, state, k, change, solution, new, n_grid):
         # The table knows the errors of the stars, not the fields of the exposures.
         x, y = o.detectors[k].grid(n_grid)
         _, covariance = change_on(o, state, k, change, x, y)
-        spread = np.sqrt(covariance[[0, 1], [0, 1]]).reshape(2, n_grid, n_grid)
-        spread /= 1.0 if moved else _STALE_MARGIN
+        spread = covariance[[0, 1], [0, 1]]
+        if not moved:
+            # Where the stored map was less certain than elsewhere, it still is.
+            before = solution.covariance(x, y)[[0, 1], [0, 1]]
+            if np.all(before > 0):
+                spread = before * min(np.mean(spread) / np.mean(before), 1.0)
+        spread = np.sqrt(spread).reshape(2, n_grid, n_grid)
         if info is None:
             sigma = np.array([*spread, np.zeros_like(spread[0])])
         else:
