@@ -12,7 +12,7 @@ import numpy as np
 from wpdc_gwcs.fitting import fit_attitude
 from wpdc_gwcs.models import deproject, project
 
-__all__ = ["Geometry", "start_geometry"]
+__all__ = ["Geometry", "mean_direction", "start_geometry"]
 
 # Sky positions of a frame that stand for its linear WCS, along each axis.
 _POINTS = 4
@@ -166,7 +166,7 @@ def _start_mosaic(o, n_detectors, n_exposures):
             e = first if first in todo else e
             frames = o.frames_of(e)
             centers = np.array([points[k][1][:, 0] for k in frames])
-            pointing[e] = _mean_direction(centers)
+            pointing[e] = mean_direction(centers)
             cd[e] = _first_matrix(o.frames[frames[0]], pointing[e])
         else:
             frames = [k for k in o.frames_of(e) if known[o.detector_of[k]]]
@@ -194,7 +194,19 @@ def _points(frame, detector):
     return offset, np.array(deproject(*(np.asarray(frame.cd, float) @ offset), frame.crval))
 
 
-def _mean_direction(sky):
+def mean_direction(sky):
+    """Mean of directions as vectors: right ascensions do not average across 0 h.
+
+    Parameters
+    ----------
+    sky : (N, 2) array_like
+        Right ascensions and declinations, deg.
+
+    Returns
+    -------
+    (2,) ndarray
+        Right ascension and declination, deg.
+    """
     ra, dec = np.radians(np.asarray(sky)).T
     x, y, z = np.mean([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
     return np.degrees([np.arctan2(y, x) % (2 * np.pi), np.arctan2(z, np.hypot(x, y))])
@@ -218,7 +230,7 @@ def _fit_pointing(o, frames, points, place, matrix, start):
     )
     sky = np.concatenate([points[k][1] for k in frames], axis=1)
     fit = fit_attitude(
-        *focal, *sky, crpix=(0.0, 0.0), crval=_mean_direction(sky.T), cd=_turned(focal, sky, start),
+        *focal, *sky, crpix=(0.0, 0.0), crval=mean_direction(sky.T), cd=_turned(focal, sky, start),
         clip=np.inf,
     )  # fmt: skip
     return fit.crval, fit.cd
@@ -226,7 +238,7 @@ def _fit_pointing(o, frames, points, place, matrix, start):
 
 def _turned(focal, sky, start):
     """Fit the starting CD of an exposure of any roll, on the plane about its own middle."""
-    plane = np.array(project(*sky, _mean_direction(sky.T)))
+    plane = np.array(project(*sky, mean_direction(sky.T)))
     a = focal - focal.mean(1, keepdims=True)
     b = plane - plane.mean(1, keepdims=True)
     matrix = np.linalg.lstsq(a.T, b.T, rcond=None)[0].T

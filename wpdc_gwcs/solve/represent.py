@@ -8,6 +8,7 @@ from wpdc_gwcs.fitting import WPDCFitter, fit_attitude, robust_sigma
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 from wpdc_gwcs.solution import DistortionSolution
 from wpdc_gwcs.solve.exposure import ExposureFit
+from wpdc_gwcs.solve.geometry import mean_direction
 from wpdc_gwcs.solve.model import block, colored, undistorted
 from wpdc_gwcs.solve.state import predict_variance
 
@@ -84,7 +85,7 @@ def _nominal_plane(o, state, k, frame, x, y, cd):
     if len(o.detectors) == 1:
         exposures = sorted({int(o.exposure_of[f]) for f in state.active})
         cd0 = geometry.cd[exposures].mean(0) if cd is None else np.asarray(cd, float)
-        return cd0, _mean_direction(geometry.pointing[exposures]), cd0 @ focal
+        return cd0, mean_direction(geometry.pointing[exposures]), cd0 @ focal
     e = int(o.exposure_of[frame])
     step = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) + detector.crpix[:, None]
     at = geometry.sky(e, undistorted(state.model, k, detector, *step))
@@ -95,13 +96,6 @@ def _nominal_plane(o, state, k, frame, x, y, cd):
         crval,
         np.array(project(*geometry.sky(e, focal), crval)),
     )
-
-
-def _mean_direction(sky):
-    """Mean pointing as a vector: right ascensions do not average across 0 h."""
-    ra, dec = np.radians(sky).T
-    x, y, z = np.mean([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
-    return np.degrees([np.arctan2(y, x) % (2 * np.pi), np.arctan2(z, np.hypot(x, y))])
 
 
 def sigma_grid(covariance, n):
