@@ -311,3 +311,15 @@ def test_few_stars_know_how_well_they_know(simulation, catalog):
     sigma = np.array(calibration.uncertainty(x, y)[:2])
     inside = np.isfinite(dx)
     assert np.mean(np.abs([dx[inside], dy[inside]]) < 3 * sigma[:, inside]) > 0.9
+
+
+def test_two_cameras_with_detectors_of_one_name(simulation, catalog):
+    """Neither takes the other's solution."""
+    frames = [
+        replace(exposure.frame(), camera=camera, exposure=exposure.name)
+        for exposure, camera in zip(simulation.exposures, ("north", "south", "south"))
+    ]
+    run = calibrate(frames, catalog)
+    assert len(run.calibrations) == 3
+    name = frames[0].detector
+    assert sorted(run.solutions) == [f"north-{name}", f"south-{name}"]

@@ -121,7 +121,7 @@ def calibrate(
     progress = progress or (lambda stage, done, total: None)
     # Once and from the whole catalogue: a star moves alike in all frames.
     catalog = fill_motions(catalog)
-    frames = tie_exposures(frames)
+    frames = _named_apart(tie_exposures(frames)) if solution is None else tie_exposures(frames)
 
     solution = getattr(solution, "solutions", solution)
     common = {"catalog": catalog, "solution": solution, "settings": settings}
@@ -179,6 +179,19 @@ def _of_other_detectors(frames, solution):
         )
         for f in frames
     }
+
+
+def _named_apart(frames):
+    """Frames whose detectors have different names where they are of different cameras."""
+    cameras = {}
+    for frame in frames:
+        cameras.setdefault(frame.detector, set()).add(frame.camera)
+    return [
+        replace(frame, detector=f"{frame.camera}-{frame.detector}")
+        if frame.camera is not None and len(cameras[frame.detector]) > 1
+        else frame
+        for frame in frames
+    ]
 
 
 def _camera_of(group, solutions, calibrations):
