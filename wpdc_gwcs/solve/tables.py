@@ -13,6 +13,9 @@ __all__ = ["choose_tables", "folds", "residual_maps", "with_tables"]
 # Detectors of a camera whose tables are all tried in every way; the others take their settings.
 _DETECTORS_TRIED = 3
 
+# With more stars than this a detector knows its own structure better than others do.
+_OWN_SETTINGS = 6000
+
 # Detectors with fewer stars than this share of the richest one find settings of their own.
 _SHARE_OF_STARS = 0.25
 
@@ -131,8 +134,8 @@ def choose_tables(maps, lut):
     Returns
     -------
     list of (TableChoice, tuple)
-        Settings and the candidates they were chosen from; in a large camera most detectors take
-        the settings of those with the most stars.
+        Settings and the candidates they were chosen from; in a large camera detectors of some
+        stars take the settings of those with the most.
     """
     if len(maps) <= _DETECTORS_TRIED:
         return [choose_table(m, lut=lut) for m in maps]
@@ -141,4 +144,6 @@ def choose_tables(maps, lut):
     tried.sort(key=lambda found: (found[0].kernel == "none", found[0].freedom))
     common = tried[_DETECTORS_TRIED // 2]
     enough = _SHARE_OF_STARS * maps[order[0]].n_stars
-    return [common if m.n_stars >= enough else choose_table(m, lut=lut) for m in maps]
+    return [
+        common if enough <= m.n_stars < _OWN_SETTINGS else choose_table(m, lut=lut) for m in maps
+    ]
