@@ -266,7 +266,13 @@ def refraction():
         return _both_axes(b.color[:, None])
 
     return Term(
-        "refraction", "exposure", np.zeros(2, int), np.array([0.1]), 0.0, design, chromatic=True
+        "refraction",
+        "exposure",
+        np.zeros(2, int),
+        np.array([_START_COLOR]),
+        0.0,
+        design,
+        chromatic=True,
     )
 
 
@@ -285,5 +291,11 @@ def lateral_color():
         return np.stack([radial, radial * square], axis=2)
 
     return Term(
-        "lateral color", "camera", np.zeros(2, int), np.array([0.1]), 0.0, design, chromatic=True
+        "lateral color",
+        "camera",
+        np.zeros(2, int),
+        np.array([_START_COLOR]),
+        0.0,
+        design,
+        chromatic=True,
     )
