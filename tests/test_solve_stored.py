@@ -11,7 +11,7 @@ from wpdc_gwcs import ResidualMap, detect_drift
 from wpdc_gwcs.models import deproject
 from wpdc_gwcs.solve import Exposure, solve
 from wpdc_gwcs.solve.field import Spectrum
-from wpdc_gwcs.solve.stored import summarize_fields
+from wpdc_gwcs.solve.strength import summarize_fields
 
 SIDE = 1024
 CENTER = 0.5 * (SIDE - 1)

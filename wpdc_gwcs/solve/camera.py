@@ -8,6 +8,7 @@ import numpy as np
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.fitting import RadialWeight
 from wpdc_gwcs.solve import terms as make
+from wpdc_gwcs.solve.change import find_change
 from wpdc_gwcs.solve.errors import worse_scatter
 from wpdc_gwcs.solve.exposure import SolveResult
 from wpdc_gwcs.solve.fields import with_fields, with_spectra, with_statics
@@ -28,13 +29,8 @@ from wpdc_gwcs.solve.state import (
     with_clipping,
     with_error_models,
 )
-from wpdc_gwcs.solve.stored import (
-    StoredMap,
-    find_change,
-    summarize_fields,
-    unswallowed_maps,
-    updated_solution,
-)
+from wpdc_gwcs.solve.stored import StoredMap, unswallowed_maps, updated_solution
+from wpdc_gwcs.solve.strength import summarize_fields
 from wpdc_gwcs.solve.tables import choose_tables, folds, residual_maps, with_tables
 
 __all__ = ["solve"]

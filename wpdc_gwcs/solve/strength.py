@@ -1,0 +1,114 @@
+"""Strength of the exposures' fields, as stored solutions remember it for the exposures to come."""
+
+import numpy as np
+
+__all__ = ["FieldPrior", "log_strength", "summarize_fields"]
+
+# Scatter of the logarithm of the fields' strength where nothing is known of it, and the number of
+# exposures that this guess is worth; least strength in units of the stars' errors.
+_LOG_STRENGTH, _GUESS_WEIGHT = 1.0, 0.5
+_LEAST_STRENGTH = 0.1
+
+# Scatter of the logarithms of an outer scale, and of a strength that no solution tells.
+_LOG_SCALE, _LOG_UNKNOWN = 0.7, 1.5
+
+
+class FieldPrior:
+    """What is known of the strength of an exposure's field.
+
+    Parameters
+    ----------
+    known : dict or None
+        Of the exposures of the stored solution, see `summarize_fields`.
+    errors : float
+        Typical error of a star, px.
+    scales : (2,) ndarray
+        Logarithms of the least and the largest outer scale, px.
+    wavelength : float
+        Where the strength is counted, px, see `log_strength`.
+    """
+
+    def __init__(self, known, errors, scales, wavelength):
+        self.wavelength = wavelength
+        self.known = bool(known)
+        self.scale = 0.5 * scales.sum()
+        level = np.log(0.5 * errors)
+        self.scatter = _LOG_UNKNOWN
+        if known:
+            if known["amplitude"] > 0:
+                self.scale = float(np.clip(np.log(known["scale"]), *scales))
+            level = np.log(max(known["amplitude"], _LEAST_STRENGTH * errors))
+            self.scatter = known["scatter"]
+        self.strength = level + log_strength(0.0, self.scale, wavelength)
+
+    def penalty(self, amplitude, scale):
+        """Minus the log prior.
+
+        Parameters
+        ----------
+        amplitude, scale : float
+            Logarithms of amplitude and outer scale, px.
+        """
+        strength = log_strength(amplitude, scale, self.wavelength) - self.strength
+        return 0.5 * (strength / self.scatter) ** 2 + 0.5 * ((scale - self.scale) / _LOG_SCALE) ** 2
+
+
+def log_strength(amplitude, scale, wavelength):
+    """Logarithm of the root of a field's power at a wavelength, from those of amplitude and scale.
+
+    At half the side of a detector it is well known; amplitude and outer scale, mostly larger than
+    the detector, are not.
+
+    Parameters
+    ----------
+    amplitude, scale : float
+        Logarithms of amplitude and outer scale, px.
+    wavelength : float
+        Px.
+    """
+    return amplitude + scale - 11 / 12 * np.log1p((np.exp(scale) / wavelength) ** 2)
+
+
+def summarize_fields(spectra, image_shape, previous=None):
+    """Typical field of some exposures, for the updates to come.
+
+    Parameters
+    ----------
+    spectra : sequence of Spectrum or None
+        Of the exposures; `None` for none.
+    image_shape : (int, int)
+        Shape of the detector.
+    previous : dict, optional
+        The same of the exposures of the stored solution.
+
+    Returns
+    -------
+    dict
+        ``n`` exposures, ``amplitude`` (px) and ``scale`` (px) of the typical field, and
+        ``scatter`` of the logarithm of the strength; amplitude 0 where there were no fields.
+    """
+    found = [s for s in spectra if s is not None]
+    n, guess = len(spectra), _GUESS_WEIGHT * _LOG_STRENGTH**2
+    if not found:
+        scatter = np.sqrt(guess / max(n - 1 + _GUESS_WEIGHT, 1))
+        own = {"n": n, "amplitude": 0.0, "scale": 1.0, "scatter": float(scatter)}
+    else:
+        scale = np.mean([np.log(s.scale) for s in found])
+        wavelength = 0.5 * max(image_shape)
+        strengths = np.array(
+            [log_strength(np.log(s.amplitude), np.log(s.scale), wavelength) for s in found]
+        )
+        square = guess + np.sum((strengths - strengths.mean()) ** 2)
+        own = {
+            "n": n,
+            "amplitude": float(np.exp(strengths.mean() - log_strength(0.0, scale, wavelength))),
+            "scale": float(np.exp(scale)),
+            "scatter": float(np.sqrt(square / max(len(found) - 1 + _GUESS_WEIGHT, 1))),
+        }
+    if not previous or (previous["amplitude"] == 0) != (own["amplitude"] == 0):
+        return own if not previous or own["n"] >= previous["n"] else previous
+    total = own["n"] + previous["n"]
+    share = own["n"] / total
+    merged = {k: float(share * own[k] + (1 - share) * previous[k]) for k in ("scale", "scatter")}
+    amplitude = share * own["amplitude"] + (1 - share) * previous["amplitude"]
+    return {"n": total, "amplitude": float(amplitude), **merged}
