@@ -131,7 +131,8 @@ def test_detectors_have_their_own_solutions(poor):
     assert np.sign(a[0, 0]) == -np.sign(c[0, 0])
     for name, solution in result.solutions.items():
         assert solution.detector == name
-        assert_allclose(solution.wcs(*solution.crpix), solution.crval, atol=1e-7)
+        # The table follows the shortest waves to a hundredth of a pixel.
+        assert_allclose(solution.wcs(*solution.crpix), solution.crval, atol=0.01 * SCALE)
 
 
 COLOR_SHIFT = np.array([0.06, -0.04])  # px / mag

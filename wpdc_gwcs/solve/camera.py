@@ -49,6 +49,8 @@ _PV_DEGREE = 3
 # Steps of the alternation.
 _ROUNDS_ALIGN = 6
 _ROUNDS_FIELD = 2
+# Before their waves are known, the errors of the stars seem larger than they are.
+_ROUNDS_WAVES = 2
 
 # Scatter that no distortion model leaves of right pairs, px.
 _MAX_SCATTER = 2.0
@@ -205,8 +207,8 @@ def solve(
     infos = [None] * len(o.detectors)
     choices = None if table_choice is None else [(table_choice[n], ()) for n in names]
     alone = o.n_exposures == 1
-    mosaic = len(o.detectors) > 1 and not stored
-    if mosaic and lut != "none":
+    waves = lut != "none" and not stored and (not alone or len(o.detectors) > 1)
+    for _ in range(_ROUNDS_WAVES if waves else 0):
         state = _settled(o, with_statics(o, state), clip, pool_attitudes)
         state = with_error_models(o, state)
     if lut != "none" and not stored and not alone:
@@ -228,7 +230,7 @@ def solve(
             state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE)
             # What was scatter before is field now: the errors are smaller than they seemed.
             state = with_error_models(o, state)
-            if mosaic and lut != "none":
+            if waves:
                 state = with_statics(o, state)
             if lut != "none" and not stored and not alone:
                 state, infos = with_tables(

@@ -493,6 +493,11 @@ class Field:
         return self._covariance(self.basis.design(focal, self.spectrum.kind) * self._prior_root)
 
     @property
+    def wave(self):
+        """Wave vectors ``(2, M)``, rad / px."""
+        return self.basis.wave
+
+    @property
     def _prior_root(self):
         return np.sqrt(self.spectrum.prior(self.basis))
 

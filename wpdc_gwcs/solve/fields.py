@@ -12,8 +12,9 @@ from wpdc_gwcs.solve.field import (
     pooled_spectrum,
     products,
 )
-from wpdc_gwcs.solve.model import design, focal_variance, residuals
-from wpdc_gwcs.solve.surface import of_field
+from wpdc_gwcs.solve.model import block, design, focal_variance, residuals
+from wpdc_gwcs.solve.surface import SummedField, of_field
+from wpdc_gwcs.solve.waves import fit_waves
 
 __all__ = ["with_fields", "with_spectra", "with_statics"]
 
@@ -22,8 +23,11 @@ __all__ = ["with_fields", "with_spectra", "with_statics"]
 _MOST_MARGINAL, _MOST_FINAL = 250, 1000
 _STARS_PER_WAVE_MARGINAL, _STARS_PER_WAVE = 3, 4
 
-# With more stars on each detector than this, its table finds by itself what the exposures share, in
-# more detail than these waves.
+# Stars of a detector, of all exposures, that tell its waves.
+_LEAST_WAVES = 100
+
+# With more stars on each detector than this, its table finds by itself what else the exposures
+# share, in more detail than a field.
 _TABLE_ALONE = 6000
 
 # Waves of what the exposures of a detector share, and stars that its spectrum is learnt from.
@@ -160,10 +164,11 @@ def with_fields(o, state):
 
 
 def with_statics(o, state):
-    """State with a smooth field for each detector of a mosaic, shared by its exposures.
+    """State with the smooth structure of each detector that its exposures share.
 
-    The spectrum is learnt from all detectors: what one of them cannot tell of its own few stars,
-    the others tell of its kind.
+    The waves that stand out, see `fit_waves`, and where there are not enough stars for a table, a
+    field of what else there is.  Its spectrum is learnt from all detectors: what one of them cannot
+    tell of its own few stars, the others tell of its kind.
 
     Parameters
     ----------
@@ -175,19 +180,33 @@ def with_statics(o, state):
     Returns
     -------
     State
-        All detectors have a field of one spectrum, or none where their stars do not speak for it or
-        are so many that a table does better.
+        Detectors of too few stars have no waves, those of many no field.
     """
     plain = replace(state, model=state.model.changed(statics={}))
-    stars = {}
+    stars, statics = {}, {}
     for k in range(len(o.detectors)):
-        parts = [_stars(o, plain, f) for f in state.active if o.detector_of[f] == k]
-        if parts:
-            stars[k] = [np.concatenate([p[i] for p in parts], axis=1) for i in range(3)]
-    boxes = {k: _box(o, state, k, 0.0) for k in stars}
+        frames = [f for f in state.active if o.detector_of[f] == k]
+        if not frames:
+            continue
+        parts = [_stars(o, plain, f) for f in frames]
+        places = [_places(o, plain, f) for f in frames]
+        stars[k] = [np.concatenate(places, axis=1)]
+        stars[k] += [np.concatenate([p[i] for p in parts], axis=1) for i in (1, 2)]
+        if stars[k][0].shape[1] >= _LEAST_WAVES:
+            box = _box(o, state, k, 0.0)
+            statics[k] = of_field(fit_waves(*box, *stars[k]), *box)
+            stars[k][1] = stars[k][1] - statics[k](stars[k][0])
+    for k, field in _common_fields(o, state, stars).items():
+        statics[k] = SummedField((statics[k], field)) if k in statics else field
+    return replace(state, model=state.model.changed(statics=statics))
+
+
+def _common_fields(o, state, stars):
+    """Fields of one spectrum for all detectors of a mosaic, if their stars speak for it."""
     typical = float(np.median([columns[0].shape[1] for columns in stars.values()]))
-    if typical > _TABLE_ALONE:
-        return plain
+    if len(o.detectors) == 1 or typical > _TABLE_ALONE:
+        return {}
+    boxes = {k: _box(o, state, k, 0.0) for k in stars}
     n = int(np.clip(typical, 12, _MOST_STATIC))
     longest = max(float(np.max(high - low)) for low, high in boxes.values())
     spacing = longest / np.sqrt(max(typical, 1.0))
@@ -203,13 +222,11 @@ def with_statics(o, state):
         start=_FIRST_STATIC * np.sqrt(np.median(state.sigma[:, state.kept] ** 2)),
         scales=(min(2 * spacing, 0.5 * longest), 4 * longest),
     )
-    statics = {}
-    if spectrum is not None:
-        statics = {
-            k: of_field(fit_field(patch(*boxes[k], n), spectrum, *stars[k]), *boxes[k])
-            for k in stars
-        }
-    return replace(state, model=state.model.changed(statics=statics))
+    if spectrum is None:
+        return {}
+    return {
+        k: of_field(fit_field(patch(*boxes[k], n), spectrum, *stars[k]), *boxes[k]) for k in stars
+    }
 
 
 def _affine(focal):
@@ -226,3 +243,10 @@ def _stars(o, state, f):
     residual, focal = residuals(state.model, o, f)
     variance = focal_variance(state.model, o, f, state.sigma[:, s])
     return focal[:, kept], -residual[:, kept], variance[:, kept]
+
+
+def _places(o, state, f):
+    """Places of the kept pairs of a frame on the focal plane, without distortion."""
+    s, k = o.slices[f], int(o.detector_of[f])
+    kept = state.kept[s]
+    return block(state.model, k, o.detectors[k], o.x[s][kept], o.y[s][kept])[1]

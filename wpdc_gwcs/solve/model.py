@@ -31,7 +31,8 @@ class Model:
     fields : dict
         Frame to its `Field`; no entry for none.
     statics : dict
-        Detector to the `Field` that all its exposures share; no entry for none.
+        Detector to the `Field` that all its exposures share, as a function of the place on the
+        focal plane without distortion: it belongs to the pixels; no entry for none.
     """
 
     geometry: Geometry
@@ -129,7 +130,8 @@ def undistorted(model, k, detector, x, y):
     (2, N) ndarray
         Px of the focal plane.
     """
-    b, focal = block(model, k, detector, x, y)
+    b, place = block(model, k, detector, x, y)
+    focal = place
     for term in model.scoped("camera", "detector"):
         if term.chromatic:
             continue
@@ -137,7 +139,7 @@ def undistorted(model, k, detector, x, y):
         c = c if term.scope == "camera" else c[k]
         if np.any(c):
             focal = focal + term.design(b) @ c
-    return focal + model.statics[k](focal) if k in model.statics else focal
+    return focal + model.statics[k](place) if k in model.statics else focal
 
 
 def colored(model, exposure, b):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
-__all__ = ["SampledField", "TableSurface", "of_field", "of_table"]
+__all__ = ["SampledField", "SummedField", "TableSurface", "of_field", "of_table"]
 
 # Nodes for the shortest wave of a field: the spline then is good to a thousandth of it.
 _NODES_PER_WAVE = 6
@@ -89,6 +89,49 @@ class SampledField:
         return self.field.covariance(focal)
 
 
+@dataclass(frozen=True, eq=False)
+class SummedField:
+    """The sum of independent fields.
+
+    Parameters
+    ----------
+    parts : tuple of SampledField
+        What is added.
+    """
+
+    parts: tuple
+
+    def __call__(self, focal):
+        """Displacement at focal plane positions.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+
+        Returns
+        -------
+        (2, N) ndarray
+            Px.
+        """
+        return sum(part(focal) for part in self.parts)
+
+    def covariance(self, focal):
+        """Posterior covariance.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+
+        Returns
+        -------
+        (2, 2, N) ndarray
+            Px^2.
+        """
+        return sum(part.covariance(focal) for part in self.parts)
+
+
 def of_table(table):
     """Put a look-up table into splines that are set up once.
 
@@ -127,7 +170,7 @@ def of_field(field, low, high):
         The field on a grid.
     """
     size = high - low
-    shortest = 2 * np.pi / np.abs(field.basis.wave).max(axis=1)
+    shortest = 2 * np.pi / np.abs(field.wave).max(axis=1)
     n = np.ceil(_NODES_PER_WAVE * size / shortest).astype(int) + 4
     grids = [
         np.linspace(a - _MARGIN * s, b + _MARGIN * s, m) for a, b, s, m in zip(low, high, size, n)

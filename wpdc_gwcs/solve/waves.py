@@ -1,0 +1,253 @@
+"""The structure of a detector: few shapes out of many, found by sparse Bayesian learning.
+
+What the terms leave of a detector is neither noise nor one smooth random field: it is made of some
+waves and high polynomials, and most others are absent.  Each has a variance of its own, which the
+stars tell; those that they do not speak for shrink to nothing, so that the many candidates add no
+noise.
+
+::
+
+    places, residuals, errors --normal matrix--> variance of each wave --> coefficients, covariance
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from scipy.linalg import lapack
+
+__all__ = ["Waves", "candidates", "fit_waves"]
+
+# The period of the waves is so many times the detector: finer steps of the wave number than
+# its own size, because a wave of the sensor does not end at its rim.
+_OVERSIZE = 1.6
+
+# Shortest wave in units of the longer side.
+_SHORTEST = 0.1
+
+# Largest degree of the polynomials; of those that other terms have, and stars for each of these, if
+# they are to be fitted freely beside the waves: they have taken a part of them already.
+_DEGREE = 9
+_FREE_DEGREE, _STARS_PER_TERM = 5, 40
+
+# Share of the variance that a coefficient has by itself, from all stars, which is left to a wave
+# that is not seen, and the number of coefficients that this guess is worth.  In noise alone a
+# quarter of a coefficient for each ten candidates remains, in units of its error.
+_FLOOR, _GUESS_WEIGHT = 0.02, 1.0
+
+# Steps of the variances, by then they move by a few per cent.
+_STEPS = 8
+
+# Times that the step of the wave numbers is halved about those waves of which the stars determine
+# so many coefficients: a wave between two candidates would need many of them.
+_ZOOMS, _SEEN = 2, 0.5
+
+# Most waves that a finer step is tried for; those of the largest power.
+_MOST_ZOOMED = 60
+
+# With more stars than this they are averaged in cells, so many along the shortest wave.
+_MOST_STARS, _CELLS_PER_WAVE = 20_000, 20
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """Displacements of the focal plane as a sum of plane waves and polynomials.
+
+    Parameters
+    ----------
+    center, size : (2,) ndarray
+        Middle and sides of the detector's part of the focal plane, px.
+    wave : (2, M) ndarray
+        Wave vectors, rad / px.
+    least_degree : int
+        Of the polynomials; those below are in other terms.
+    coefficients : (2, K) ndarray
+        Of cosines, sines and polynomials, for each axis, px.
+    half : (K, K) ndarray
+        Products of these with themselves, H^T H, are the covariance of the coefficients of an axis.
+    """
+
+    center: np.ndarray
+    size: np.ndarray
+    wave: np.ndarray
+    least_degree: int
+    coefficients: np.ndarray
+    half: np.ndarray
+
+    def __call__(self, focal):
+        """Displacement at focal plane positions.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+
+        Returns
+        -------
+        (2, N) ndarray
+            Px.
+        """
+        return self.coefficients @ self._columns(focal).T
+
+    def covariance(self, focal):
+        """Posterior covariance, the same along both axes.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+
+        Returns
+        -------
+        (2, 2, N) ndarray
+            Px^2.
+        """
+        rows = self.half @ self._columns(focal).T
+        out = np.zeros((2, 2, focal.shape[1]))
+        out[0, 0] = out[1, 1] = np.sum(rows**2, axis=0)
+        return out
+
+    def _columns(self, focal):
+        return _columns(self.center, self.size, self.wave, self.least_degree, focal)
+
+
+def _columns(center, size, wave, least_degree, focal):
+    """Cosines and sines, and the polynomials of the higher degrees."""
+    phase = (focal - center[:, None]).T @ wave
+    high = _polynomials(center, size, focal, range(least_degree, _DEGREE + 1))
+    return np.hstack([np.cos(phase), np.sin(phase), high])
+
+
+def _polynomials(center, size, focal, degrees):
+    """Products of Legendre polynomials."""
+    u, v = (legvander(m, _DEGREE).T for m in 2.0 * (focal - center[:, None]) / size[:, None])
+    rows = [u[i] * v[n - i] for n in degrees for i in range(n + 1)]
+    return np.transpose(rows) if rows else np.zeros((focal.shape[1], 0))
+
+
+def candidates(low, high):
+    """Wave vectors of all waves that a detector may have, and the step between them.
+
+    Parameters
+    ----------
+    low, high : (2,) ndarray
+        Corners of its part of the focal plane, px.
+
+    Returns
+    -------
+    orders : (2, M) ndarray of int
+        In units of the step; of each pair of opposite vectors one.
+    step : (2,) ndarray
+        Rad / px.
+    """
+    size = np.asarray(high, float) - low
+    step = 2 * np.pi / (_OVERSIZE * size)
+    largest = 2 * np.pi / (_SHORTEST * size.max())
+    n = (largest / step).astype(int)
+    j, k = (a.ravel() for a in np.meshgrid(np.arange(-n[0], n[0] + 1), np.arange(n[1] + 1)))
+    one_of_two = (k > 0) | (j > 0)
+    short = np.hypot(j * step[0], k * step[1]) > largest
+    return np.array([j, k])[:, one_of_two & ~short], step
+
+
+def _finer(orders, strong):
+    """Orders for half the step: the same ones, and those round the strong ones, once."""
+    around = np.array(np.meshgrid([-1, 0, 1], [-1, 0, 1])).reshape(2, 1, 9)
+    every = np.hstack([2 * orders, (2 * strong[:, :, None] + around).reshape(2, -1)])
+    # Of opposite vectors one; the constant is no wave.
+    every = np.where((every[1] < 0) | ((every[1] == 0) & (every[0] < 0)), -every, every)
+    return np.unique(every[:, np.any(every != 0, axis=0)], axis=1)
+
+
+def fit_waves(low, high, focal, residual, variance):
+    """Find the waves of a detector.
+
+    Parameters
+    ----------
+    low, high : (2,) ndarray
+        Corners of its part of the focal plane, px.
+    focal, residual, variance : (2, N) ndarray
+        Places, residuals and their variances, px.
+
+    Returns
+    -------
+    Waves
+        Beside polynomials of low degree, which are not part of them.
+
+    Notes
+    -----
+    The four coefficients of a wave, or the two of a polynomial, have the variance p; evidence is
+    largest at p = m^2 / g, with the sum m^2 of the squares of their posterior means, and g, the
+    number of them that the stars determine (MacKay's step).  Both axes have the mean of their
+    weights.
+
+    References
+    ----------
+    MacKay (1992), Neural Computation 4, 415; Tipping (2001), JMLR 1, 211.
+    """
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    center, size = 0.5 * (low + high), high - low
+    weight = np.mean(1.0 / variance, axis=0)
+    if focal.shape[1] > _MOST_STARS:
+        side = _SHORTEST * size.max() / _CELLS_PER_WAVE
+        focal, residual, weight = _averaged(focal, residual, weight, side)
+    orders, step = candidates(low, high)
+    terms = np.cumsum(np.arange(_FREE_DEGREE + 1) + 1)
+    least_degree = max(np.count_nonzero(terms * _STARS_PER_TERM <= focal.shape[1]), 2)
+    for zoom in range(_ZOOMS + 1):
+        shape = center, size, orders * step[:, None], least_degree
+        normal, right = _normal_equations(shape, focal, residual, weight)
+        root, known = _learned(normal, right, orders.shape[1], _FLOOR / weight.sum())
+        seen = np.flatnonzero(known > _SEEN)
+        if zoom == _ZOOMS or not seen.size:
+            break
+        strong = seen[np.argsort(-root[seen], kind="stable")[:_MOST_ZOOMED]]
+        orders, step = _finer(orders[:, seen], orders[:, strong]), 0.5 * step
+    half = lapack.dtrtrs(_factor(normal, root), np.diag(root), lower=1)[0]
+    return Waves(*shape, (half.T @ (half @ right)).T, half.astype(np.float32))
+
+
+def _learned(normal, right, n, least):
+    """Prior standard deviation of each coefficient, and how many of each wave are determined."""
+    group = np.concatenate([np.arange(n), np.arange(n), np.arange(n, len(normal) - n)])
+    power = np.full(group[-1] + 1, 10.0 * least)
+    for _ in range(_STEPS):
+        root = np.sqrt(power)[group]
+        factor = _factor(normal, root)
+        inverse = lapack.dpotri(factor, lower=1)[0]
+        scaled = lapack.dpotrs(factor, root[:, None] * right, lower=1)[0]
+        square = np.bincount(group, np.sum((root[:, None] * scaled) ** 2, axis=1))
+        known = np.bincount(group, 2 * (1.0 - np.diagonal(inverse)))
+        power = (_GUESS_WEIGHT * least + square) / (_GUESS_WEIGHT + known)
+    return np.sqrt(power)[group], known[:n]
+
+
+def _factor(normal, root):
+    """Lower Cholesky factor of the posterior precision in units of the prior."""
+    inner = normal * root[:, None] * root
+    inner[np.diag_indices_from(inner)] += 1.0
+    return lapack.dpotrf(inner, lower=1, clean=1)[0]
+
+
+def _normal_equations(shape, focal, residual, weight):
+    """Take free polynomials out of the normal matrix and the right-hand sides."""
+    rows = _columns(*shape, focal)
+    free = _polynomials(*shape[:2], focal, range(shape[3]))
+    heavy = rows * weight[:, None]
+    normal, right = heavy.T @ rows, heavy.T @ residual.T
+    cross = free.T @ heavy
+    solved = np.linalg.lstsq(
+        (free * weight[:, None]).T @ free,
+        np.hstack([cross, free.T @ (weight * residual).T]),
+        rcond=1e-12,
+    )[0]
+    return normal - cross.T @ solved[:, :-2], right - cross.T @ solved[:, -2:]
+
+
+def _averaged(focal, residual, weight, side):
+    """Stars of each cell as one."""
+    cell = ((focal - focal.min(1, keepdims=True)) / side).astype(int)
+    _, number = np.unique(cell[0] * (cell[1].max() + 1) + cell[1], return_inverse=True)
+    total = np.bincount(number, weight)
+    mean = [[np.bincount(number, weight * c) / total for c in part] for part in (focal, residual)]
+    return np.array(mean[0]), np.array(mean[1]), total
