@@ -18,7 +18,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 
-from wpdc_gwcs.catalogs import table_format
+from wpdc_gwcs.catalogs import read_table_file
 from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.io.dates import header_epoch, header_start
@@ -440,7 +440,7 @@ def _read_text_table(path, wcs, detector, stem, image_shape, exposure_keyword):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            table = Table.read(path, format=table_format(path))
+            table = read_table_file(path)
     except READ_ERRORS as problem:
         raise FrameError(
             f"{path}: neither FITS nor a readable table of sources: {first_line(problem)}"

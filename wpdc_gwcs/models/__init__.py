@@ -14,8 +14,9 @@ from wpdc_gwcs.models.distortion import (
 )
 from wpdc_gwcs.models.lookup_table import LookupTable
 from wpdc_gwcs.models.polynomial import PVInverse, PVPolynomial
-from wpdc_gwcs.models.tangent import SkyTangent, TangentSky, deproject, project
+from wpdc_gwcs.models.tangent import SkyTangent, TangentSky
 from wpdc_gwcs.models.terms import PVTerms, pv_terms
+from wpdc_gwcs.sky import deproject, project
 
 __all__ = [
     "DetectorToSky",
