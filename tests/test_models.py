@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
 
-from wpdc_gwcs.blocks import BLOCK_SIZE, evaluate_blocks
 from wpdc_gwcs.models import (
     DetectorToSky,
     DistortionCorrection,
@@ -29,6 +28,7 @@ from wpdc_gwcs.models import (
     project,
     pv_terms,
 )
+from wpdc_gwcs.models.blocks import BLOCK_SIZE, evaluate_blocks
 
 CD = np.array([[-2.05e-5, 1e-6], [1.2e-6, 2.06e-5]])
 CRPIX = (511.5, 520.0)

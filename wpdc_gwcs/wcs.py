@@ -27,8 +27,8 @@ from astropy.modeling.models import (
 from gwcs import WCS
 from gwcs import coordinate_frames as cf
 
-from wpdc_gwcs.blocks import evaluate_blocks, run_blocks
 from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, TangentSky
+from wpdc_gwcs.models.blocks import evaluate_blocks, run_blocks
 from wpdc_gwcs.models.mapping import PlaneMap
 from wpdc_gwcs.models.powers import fit_polynomial
 

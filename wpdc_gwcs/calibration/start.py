@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from wpdc_gwcs.sky import deproject, local_plane, project
+from wpdc_gwcs.models import deproject, local_plane, project
 
 __all__ = [
     "LinearWCS",

@@ -21,6 +21,7 @@ from astropy.table import Table
 from wpdc_gwcs.catalogs import read_table_file
 from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
 from wpdc_gwcs.frame import Frame
+from wpdc_gwcs.io.celestial import parse_wcs
 from wpdc_gwcs.io.dates import header_epoch, header_start
 from wpdc_gwcs.io.exposures import camera_key, exposure_key, has_identifier
 from wpdc_gwcs.io.files import (
@@ -37,7 +38,6 @@ from wpdc_gwcs.io.headers import (
     find_extension,
     header_shape,
     header_text,
-    parse_wcs,
     positive_number,
     read_headers,
 )
@@ -159,6 +159,8 @@ def read_frames(
         ]
     frames = []
     for part in prepared:
+        for message in part["warnings"]:
+            warnings.warn(message)
         label = part["label"] if several else ""
         frames.append(_frame_of(part, path, stem, label, detector, image_shape, exposure_keyword))
     frames = _distinct(frames, prepared)
@@ -264,6 +266,12 @@ def _prepare(hdus, where, kind, index, given):
     shape = _image_shape(header) if kind == "image" else header_shape(header)
     if shape is None:
         shape = header_shape(wcs_header)
+    # While a file is open, no warning is shown: ours are repeated when it is closed.
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        parsed = parse_wcs(
+            wcs_header, hdus=hdus if given is None else None, name=where, error=FrameError
+        )
     return {
         "kind": kind,
         "index": index,
@@ -271,9 +279,8 @@ def _prepare(hdus, where, kind, index, given):
         "label": label,
         "headers": headers,
         "shape": shape,
-        "wcs": parse_wcs(
-            wcs_header, hdus=hdus if given is None else None, name=where, error=FrameError
-        ),
+        "wcs": parsed,
+        "warnings": [w.message for w in seen if issubclass(w.category, WPDCWarning)],
     }
 
 

@@ -12,7 +12,7 @@ r"""Step 1 of the WCS, detector to undistorted pixels, and its fusion with the t
 import numpy as np
 from astropy.modeling import Model, Parameter
 
-from wpdc_gwcs.blocks import evaluate_blocks
+from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.models.lookup_table import LookupTable
 from wpdc_gwcs.models.mapping import PlaneMap
 from wpdc_gwcs.models.polynomial import PVPolynomial

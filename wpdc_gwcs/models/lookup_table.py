@@ -3,7 +3,7 @@
 import numpy as np
 from astropy.modeling import Model, Parameter
 
-from wpdc_gwcs.blocks import evaluate_blocks
+from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.models.cells import CellGrid, spline_cells
 from wpdc_gwcs.models.mapping import PlaneMap
 

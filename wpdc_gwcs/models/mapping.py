@@ -7,7 +7,7 @@
 
 A cubic polynomial is bicubic on each cell of a grid, so where there is a table the polynomial is
 folded into the table's cells and costs nothing.  Everything here takes and returns contiguous
-float64 blocks; models hand over blocks through `wpdc_gwcs.blocks`.
+float64 blocks; models hand over blocks through `wpdc_gwcs.models.blocks`.
 """
 
 import numpy as np

@@ -5,7 +5,7 @@ from astropy.modeling import FittableModel, Model
 from astropy.modeling.parameters import Parameter
 from astropy.units import Quantity
 
-from wpdc_gwcs.blocks import evaluate_blocks
+from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.models.mapping import PlaneMap
 from wpdc_gwcs.models.powers import expand_pv
 from wpdc_gwcs.models.terms import pv_terms
