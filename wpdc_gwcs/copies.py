@@ -23,7 +23,10 @@ _SPREAD = 4.0
 # Differences of brightness, magnitudes: of one star in two bands, and of one star measured again.
 _MOST_APART, _ALIKE = 1.0, 0.1
 # Rows that are looked at next to each row, and the neighbor that tells how far stars are apart.
-_NEAR, _DISTANT = 4, 6
+_NEAR, _DISTANT = 6, 6
+# By chance, as many pairs are between a radius and 1.4 times as much as within it, along a line 0.4
+# of them: copies are closer together than that.
+_ANNULUS, _CROWDING = 2**0.5, 3.5
 
 
 def group_copies(points, *, reach, errors=None, mag=None, links=None):
@@ -80,23 +83,26 @@ def _near_pairs(points, reach, errors, mag):
     # the sixth neighbor is 1.4 times as far as stars are apart; with two copies of each, as far
     limit = np.minimum(_REACH * distant, reach)
     distance, other = tree.query(
-        points, k=min(_NEAR, n), distance_upper_bound=float(limit.max()) * (1 + 1e-12)
+        points, k=min(_NEAR, n), distance_upper_bound=float(limit.max()) * _ANNULUS * (1 + 1e-12)
     )
     rows = np.repeat(np.arange(n), distance.shape[1])
     distance, other = distance.ravel(), other.ravel()
     near = (rows < other) & (other < n)
     rows, other, distance = rows[near], other[near], distance[near]
-    near = distance <= np.minimum(limit[rows], limit[other])
-    rows, other, distance = rows[near], other[near], distance[near]
     apart = np.zeros(len(rows)) if mag is None else np.abs(mag[rows] - mag[other])
     known = np.isfinite(apart) & (mag is not None)
+    alike = ~known | (apart <= _ALIKE)
+    share = distance / np.minimum(limit[rows], limit[other])
+    n_alike = np.count_nonzero(alike & (share <= 1.0))
+    n_around = np.count_nonzero(alike & (share > 1.0) & (share <= _ANNULUS))
     one = np.zeros(len(rows), bool)
     if errors is not None:
         sigma = np.hypot(errors[rows], errors[other])
         one |= (distance <= _N_SIGMA * sigma) & ~(known & (apart > _MOST_APART))
-    alike = ~known | (apart <= _ALIKE)
-    share = _LEAST_SHARE_ALIKE if known.sum() > 0.5 * len(rows) else _LEAST_SHARE
-    if np.count_nonzero(alike) > max(_LEAST_COPIES, share * n):
+    least = n * (_LEAST_SHARE_ALIKE if known.sum() > 0.5 * len(rows) else _LEAST_SHARE)
+    if n_alike > max(_LEAST_COPIES, least, _CROWDING * n_around):
         # most of them are copies: their distances say how far apart copies are
-        one |= alike & (distance <= _SPREAD * np.median(distance[alike]))
+        typical = np.median(distance[alike & (share <= 1.0)])
+        one |= alike & (distance <= _SPREAD * typical)
+    one &= share <= 1.0
     return rows[one], other[one]

@@ -154,7 +154,7 @@ def shortcomings(frame, calibration, *, held, known=False, stored=None):
             "reference stars on the frame match"
         )
     if frame.epoch is None and "pmra" in frame.reference.colnames:
-        reasons.append("the frame has no epoch: the stars' motions could not be applied")
+        reasons.append("the frame has no epoch: the stars' motions could not be applied (--epoch)")
     low, high = calibration.solution.area_range
     if not (low >= _MIN_AREA and high <= _MAX_AREA):
         reasons.append(f"the map stretches the detector by {low:.2f} to {high:.2f} in area")

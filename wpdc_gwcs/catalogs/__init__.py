@@ -32,7 +32,13 @@ column                unit     meaning
 """
 
 from wpdc_gwcs.catalogs.cone import select_cone
-from wpdc_gwcs.catalogs.files import READ_ERRORS, is_fits, read_table_file, split_extension
+from wpdc_gwcs.catalogs.files import (
+    READ_ERRORS,
+    is_fits,
+    read_lines,
+    read_table_file,
+    split_extension,
+)
 from wpdc_gwcs.catalogs.motions import fill_motions, propagate
 from wpdc_gwcs.catalogs.standard import read_catalog
 
@@ -42,6 +48,7 @@ __all__ = [
     "is_fits",
     "propagate",
     "read_catalog",
+    "read_lines",
     "read_table_file",
     "select_cone",
     "split_extension",

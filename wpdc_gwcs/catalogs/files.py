@@ -2,7 +2,6 @@
 
 import bz2
 import gzip
-import io
 import lzma
 import re
 import struct
@@ -11,11 +10,12 @@ from pathlib import Path
 from xml.parsers.expat import ExpatError
 
 from astropy.io import fits
+from astropy.io.ascii import InconsistentTableError
 from astropy.io.registry import IORegistryError
 from astropy.table import Table
 from yaml import YAMLError
 
-__all__ = ["READ_ERRORS", "is_fits", "read_table_file", "split_extension"]
+__all__ = ["READ_ERRORS", "is_fits", "read_lines", "read_table_file", "split_extension"]
 
 # What astropy, asdf, the decompressors and the parsers raise on damaged or foreign files.
 READ_ERRORS = (
@@ -120,20 +120,44 @@ def read_table_file(path, format=None):
         return Table.read(path, format=format)
     if not text_format and _FOREIGN.search(_plain_name(path)):
         return Table.read(path, format="votable" if ".vot" in path.name.lower() else None)
-    with _open(path) as file:
-        content = file.read()
-    lines = _decode(content).splitlines()
+    lines = read_lines(path)
     if not any(line.strip() for line in lines):
         raise ValueError("it has no text")
     if format is None and re.match(r"\s*(<\?xml|<VOTABLE)", "\n".join(lines[:2]), re.IGNORECASE):
-        return Table.read(io.BytesIO(content), format="votable")
+        return Table.read(path, format="votable")
     if text_format:
         return Table.read(lines, format=format, fill_values=_FILL)
     if lines[0].startswith("# %ECSV"):
         return _read_ecsv(lines)
     if _plain_name(path).endswith((".csv", ".tsv")):
         return _read_csv(lines)
-    return Table.read(lines, format="ascii", fill_values=_FILL)
+    try:
+        return Table.read(lines, format="ascii", fill_values=_FILL)
+    except InconsistentTableError as problem:
+        # astropy lists all that it has tried, in fifty lines
+        raise ValueError("it has no form of a table that is known") from problem
+
+
+def read_lines(path):
+    """Read the lines of a text file.
+
+    Parameters
+    ----------
+    path : path-like
+        Compressed or not, in UTF-8, with a byte-order mark, or in latin-1.
+
+    Returns
+    -------
+    list of str
+        Lines without their ends.
+
+    Raises
+    ------
+    one of READ_ERRORS
+        If the file cannot be read or is no text.
+    """
+    with _open(path) as file:
+        return _decode(file.read()).splitlines()
 
 
 def _open(path):
