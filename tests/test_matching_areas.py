@@ -1,4 +1,4 @@
-"""Parts of a frame: a right match is not refused for the scatter of counts, a wrong part is found."""
+"""Parts of a frame: right ones pass whatever the scatter of counts, wrong ones are found."""
 
 import numpy as np
 import pytest

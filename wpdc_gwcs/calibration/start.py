@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 
+from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.models import deproject, local_plane, project
 
 __all__ = [
@@ -128,8 +129,7 @@ def header_reference_point(frame):
     if header is None:
         return center
     crpix = np.asarray(header.crpix, float)[:2] - 1
-    on_detector = -0.5 <= crpix[0] <= nx - 0.5 and -0.5 <= crpix[1] <= ny - 0.5
-    return crpix if on_detector else center
+    return crpix if on_detector(*crpix, frame.image_shape) else center
 
 
 def linear_wcs(wcs, crpix):

@@ -1,11 +1,11 @@
 """Positions at another epoch: proper motion, parallax, and what their errors add."""
 
 import numpy as np
-from astropy.stats import mad_std
 from scipy.spatial import cKDTree
 
 from wpdc_gwcs.catalogs.units import unit_column
 from wpdc_gwcs.columns import numbers_or_nan
+from wpdc_gwcs.robust import robust_scatter
 from wpdc_gwcs.sky import annual_parallax, directions, move
 
 __all__ = ["fill_motions", "propagate"]
@@ -181,7 +181,7 @@ def _motion_of_neighbors(catalog, motion, known, rows):
         for k, axis in enumerate((east, north)):
             values = np.einsum("snc,cs->sn", near, axis[:, rows[block]])
             median[k, block] = np.median(values, axis=1)
-            scatter[k, block] = mad_std(values, axis=1)
+            scatter[k, block] = robust_scatter(values, axis=1)
     return median, scatter * n / (n - 0.8) * np.sqrt(1 + np.pi / 2 / n)
 
 

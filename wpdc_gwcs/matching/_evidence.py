@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import gammaln, pdtr, pdtrc
 
+from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.matching._mapping import count_terms
 from wpdc_gwcs.matching._pairs import find_edges, one_to_one
 
@@ -350,7 +351,7 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
     by_chance *= len(usable) / max(1, len(sample))
     hit_weight = len(usable) / max(1, len(sample)) / _N_SHIFTS
     back_x, back_y = mapping.inverse(*stars.points.T)
-    inside = (back_x > -0.5) & (back_x < nx - 0.5) & (back_y > -0.5) & (back_y < ny - 0.5)
+    inside = on_detector(back_x, back_y, image_shape)
     n_reference = int(np.count_nonzero(inside))
     n_sources = len(detector)
     # half a pair in all shifts together where none was seen

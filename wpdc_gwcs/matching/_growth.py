@@ -3,9 +3,10 @@
 import numpy as np
 
 from wpdc_gwcs.matching._local import LocalCorrection
-from wpdc_gwcs.matching._mapping import find_narrow_axis, fit_smooth_map, scatter_of
+from wpdc_gwcs.matching._mapping import find_narrow_axis, fit_smooth_map
 from wpdc_gwcs.matching._pairs import find_edges, find_nearest, one_to_one
 from wpdc_gwcs.matching._problem import MAX_CROWDING
+from wpdc_gwcs.robust import plane_scatter
 
 __all__ = [
     "SLACK",
@@ -125,7 +126,7 @@ def grow_locally(problem, points, limit, fit, pairs):
         local = LocalCorrection.if_worthwhile(points[i], residual)
         scatter = fit.scatter
         if local is not None:
-            scatter = scatter_of(*(residual - local(points[i], leave_out=True)[0]).T)
+            scatter = plane_scatter(*(residual - local(points[i], leave_out=True)[0]).T)
         mapped, leverage = predict(points, fit, local)
         error = scatter * np.sqrt(1 + leverage)
         # where stars are sparse a wider radius costs nothing, and lets the mapping follow what
@@ -149,8 +150,8 @@ def final_radius(problem, mapped, pairs, scatter, leverage):
         error = problem.errors[i]
         # what the errors do not explain is the same for all: take it from the best stars
         small = error <= np.quantile(error, _BEST_SHARE)
-        floor = max(0.0, scatter_of(*difference[small].T) ** 2 - np.median(error[small]) ** 2)
-        factor = scatter_of(*(difference / np.sqrt(error**2 + floor)[:, None]).T)
+        floor = max(0.0, plane_scatter(*difference[small].T) ** 2 - np.median(error[small]) ** 2)
+        factor = plane_scatter(*(difference / np.sqrt(error**2 + floor)[:, None]).T)
         own = factor * np.sqrt(problem.errors**2 + floor)
     radius = _FINAL_RADIUS * np.sqrt(own**2 + scatter**2 * leverage)
     return np.maximum(radius, _SMALLEST_RADIUS)

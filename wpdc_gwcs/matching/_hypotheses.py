@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.matching._features import (
     MAX_NEIGHBOURS,
     N_NEIGHBOURS,
@@ -109,7 +110,7 @@ def bright_subsets(problem):
     everything = np.arange(len(problem.sources)), np.arange(len(problem.stars.points))
     if problem.flux is not None and problem.brightness is not None:
         x, y = problem.stars.points.T
-        inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
+        inside = on_detector(*problem.stars.points.T, problem.shape)
         most = _SOURCE_SURPLUS * min(len(problem.sources), max(np.count_nonzero(inside), 1))
         by_flux = np.argsort(-problem.flux, kind="stable")
         by_mag = np.argsort(-problem.brightness, kind="stable")
