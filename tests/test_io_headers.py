@@ -1,5 +1,6 @@
 """Headers: every form of the same WCS against astropy.wcs, dates, and what is refused."""
 
+import contextlib
 import copy
 import warnings
 
@@ -426,6 +427,36 @@ def test_galactic_axes():
     assert list(wcs.wcs.ctype) == ["RA---TAN", "DEC--TAN"]
     got = SkyCoord(*wcs.pixel_to_world_values(10, 2000), unit="deg")
     assert got.separation(expected).arcsec < 1e-6
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    st.dictionaries(
+        st.sampled_from(
+            "CTYPE1 CTYPE2 CRVAL1 CRVAL2 CRPIX1 CD1_1 CD1_2 CD2_1 CDELT1 CDELT2 PC1_1 CROTA2 "
+            "CUNIT1 RADESYS EQUINOX EPOCH LONPOLE LATPOLE PV1_1 PV2_1 PV1_5 A_ORDER NAXIS1 NAXIS2 "
+            "DATE-OBS MJD-OBS EXPTIME TIMESYS OBSMJD WCSAXES".split()
+        ),
+        st.one_of(
+            st.sampled_from(["RA---TAN", "DEC--TAN", "RA---SIP", "GLON-CAR", "FK4", "ICRS", "deg"]),
+            st.floats(allow_nan=False, allow_infinity=False),
+            st.integers(-10, 10),
+            st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=20),
+            st.booleans(),
+        ),
+        max_size=6,
+    )
+)
+def test_no_other_error_whatever_the_header(cards):
+    header = tpv_header(code="TAN")
+    for key, value in cards.items():
+        header[key] = value
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with contextlib.suppress(FileFormatError):
+            parse_wcs(header)
+        header_epoch([header])
+        header_start([header])
 
 
 # --- text ---------------------------------------------------------------------------------------

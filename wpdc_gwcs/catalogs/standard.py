@@ -6,60 +6,29 @@ import warnings
 
 import numpy as np
 from astropy import units as u
-from astropy.coordinates import Angle, SkyCoord
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import Table
 
 from wpdc_gwcs.catalogs.epochs import reference_epochs
 from wpdc_gwcs.catalogs.files import READ_ERRORS, is_fits, read_table_file, split_extension
+from wpdc_gwcs.catalogs.positions import find_positions, read_positions, turn_to_icrs
+from wpdc_gwcs.catalogs.stars import one_of_each, read_identifiers
 from wpdc_gwcs.catalogs.units import UNITS, unit_column
 from wpdc_gwcs.columns import (
     convert,
     find_name,
     listed,
     read_numbers,
-    read_text,
     spelled_names,
     unit_of,
 )
-from wpdc_gwcs.copies import group_copies
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
-from wpdc_gwcs.sky import directions, move
 
 __all__ = ["read_catalog"]
 
 log = logging.getLogger(__name__)
 
-# Pairs of position columns, best first; compared without regard to case.
-_POSITIONS = (
-    ("ra", "dec"),
-    ("ra_icrs", "de_icrs"),
-    ("ra_icrs", "dec_icrs"),
-    ("alphapsf_j2000", "deltapsf_j2000"),
-    ("alphawin_j2000", "deltawin_j2000"),
-    ("alpha_j2000", "delta_j2000"),
-    ("xpsf_world", "ypsf_world"),
-    ("xwin_world", "ywin_world"),
-    ("x_world", "y_world"),
-    ("raj2000", "dej2000"),
-    ("raj2000", "decj2000"),
-    ("_raj2000", "_dej2000"),
-    ("ra_j2000", "dec_j2000"),
-    ("ra_deg", "dec_deg"),
-    ("radeg", "dedeg"),
-    ("radeg", "decdeg"),
-    ("ramean", "decmean"),
-    ("coord_ra", "coord_dec"),
-    ("right_ascension", "declination"),
-    ("alpha", "delta"),
-)
-# Columns that are radians where they have no unit: the tables of the Rubin pipelines.
-_RADIANS = ("coord_ra",)
-# Stars per square degree that no catalogue has: taken for degrees, these positions are in another
-# unit.  The lower one decides where the name of the column speaks for radians already.
-_TOO_DENSE, _DENSE = 1e7, 1e5
-# Rows without which a density says nothing.
-_CROWD = 50
 
 # Output column -> aliases best first; without a unit it is that of the output.
 _OPTIONAL = {
@@ -95,14 +64,6 @@ _RED = ("phot_rp_mean_mag", "rpmag", "rp_mag")
 _SENTINELS = np.array([s * n for n in (999.0, 9999.0, 99999.0, 1e20, 1e30) for s in (1, -1)])
 # Magnitudes beyond stand for none (99, -99).
 _MOST_MAG = 90.0
-# Share of rows with impossible positions from which on it is the column that is wrong.
-_MOST_WRONG = 0.5
-# Single precision keeps so many bits of a position: of 360 deg, 0.05 arcsec.
-_SINGLE = np.finfo(np.float32).eps
-# Copies of one star are no further apart than that, arcsec; rows of one identifier twice as much.
-_COPY_REACH = 1.0
-# Reference systems that differ from ICRS by more than 0.02 arcsec, by what metadata call them.
-_OLD_SYSTEMS = {"FK4": "fk4", "B1950": "fk4", "FK4-NO-E": "fk4noeterms"}
 _MARK = "wpdc_catalog"
 
 
@@ -211,7 +172,7 @@ def _read_fits_table(path, extension):
             if not tables:
                 raise CatalogError(f"{path}: must have a table extension, has none")
             # LDAC files have a header table first, others whatever their writer liked.
-            tables.sort(key=lambda h: _find_positions(spelled_names(h.columns.names)) is None)
+            tables.sort(key=lambda h: find_positions(spelled_names(h.columns.names)) is None)
         return Table.read(tables[0], format="fits", mask_invalid=False)
 
 
@@ -231,11 +192,11 @@ def _standardize(table, name):
     if len(table) == 0:
         raise CatalogError(f"{name}: catalogue must have rows, has 0")
     spelled = spelled_names(table.colnames)
-    pair = _find_positions(spelled)
+    pair = find_positions(spelled)
     if pair is None:
         table, pair = _positions_of_coordinates(table, name)
         spelled = spelled_names(table.colnames)
-    columns, keep, rounding = _positions(table, pair, name)
+    columns, keep, rounding = read_positions(table, pair, name)
     for column, aliases in _OPTIONAL.items():
         found = find_name(spelled, aliases)
         if found is not None:
@@ -257,9 +218,9 @@ def _standardize(table, name):
     )
     if epoch is not None:
         columns["ref_epoch"] = epoch
-    _to_icrs(columns, keep, table.meta, name)
-    identifiers = _identifiers(table, spelled)
-    keep[keep] = _one_of_each(columns, keep, identifiers, name)
+    turn_to_icrs(columns, keep, table.meta, name)
+    identifiers = read_identifiers(table, spelled)
+    keep[keep] = one_of_each(columns, keep, identifiers, name)
     result = Table({c: unit_column(c, np.ascontiguousarray(v[keep])) for c, v in columns.items()})
     if identifiers is not None:
         result["source_id"] = identifiers[keep]
@@ -273,13 +234,6 @@ def _standardize(table, name):
         result["pm_from_neighbors"] = np.asarray(table[spelled["pm_from_neighbors"]])[keep]
     result.meta[_MARK] = name
     return result
-
-
-def _find_positions(spelled):
-    for ra, dec in _POSITIONS:
-        if ra in spelled and dec in spelled:
-            return spelled[ra], spelled[dec]
-    return None
 
 
 def _positions_of_coordinates(table, name):
@@ -297,123 +251,6 @@ def _positions_of_coordinates(table, name):
             read[column] = table[column]
     read.meta.update(table.meta)
     return read, ("ra", "dec")
-
-
-def _positions(table, pair, name):
-    """Positions in degrees, the rows that have one, and their rounding error in mas."""
-    found = [_angle(table[column], column, name) for column in pair]
-    values, unreadable = zip(*found, strict=True)
-    factor = _radians_to_degrees(table, pair, values, name)
-    ra, dec = (v * factor for v in values)
-    finite = np.isfinite(ra) & np.isfinite(dec)
-    if not finite.any():
-        raise CatalogError(
-            f"{name}: catalogue must have rows with finite {pair[0]!r} and {pair[1]!r}, "
-            f"none of {len(table)} has"
-        )
-    keep = finite.copy()
-    dropped = []
-    for column, angle, low, high in ((pair[0], ra, -360.0, 360.0), (pair[1], dec, -90.0, 90.0)):
-        wrong = keep & ((angle < low) | (angle > high))
-        if not wrong.any():
-            continue
-        row = int(np.flatnonzero(wrong)[0])
-        rule = f"column {column!r} must lie in [{low:g}, {high:g}] deg, got {angle[row]:g}"
-        if wrong.sum() > _MOST_WRONG * finite.sum():
-            raise CatalogError(f"{name}: {rule} in row {row}")
-        dropped.append(f"{wrong.sum()} out of range ({rule} in row {row})")
-        keep &= ~wrong
-    broken = unreadable[0] | unreadable[1]
-    if broken.any():
-        row = int(np.flatnonzero(broken)[0])
-        cells = ", ".join(repr(str(table[column][row])) for column in pair)
-        dropped.append(f"{broken.sum()} that cannot be read ({cells} in row {row})")
-    missing = int(np.sum(~finite & ~broken))
-    if missing:
-        log.info("%s: %d of %d rows have no position", name, missing, len(table))
-    if dropped:
-        warnings.warn(
-            f"{name}: {np.sum(~keep) - missing} of {len(table)} rows are left out: "
-            + "; ".join(dropped),
-            WPDCWarning,
-        )
-    if not keep.any():
-        raise CatalogError(f"{name}: none of {len(table)} rows has a position that can be used")
-    rounding = 0.0
-    if any(getattr(table[column], "dtype", None) == np.float32 for column in pair):
-        # half a step of the last bit at most, a uniform distribution
-        step = _SINGLE * 2.0 ** np.floor(np.log2(max(np.nanmax(np.abs(ra[keep])), 1e-3)))
-        rounding = float(step * 3.6e6 / np.sqrt(12))
-        warnings.warn(
-            f"{name}: positions are in single precision, which rounds them by up to "
-            f"{step * 1.8e6:.2g} mas: a catalogue in double precision gives a better solution",
-            WPDCWarning,
-        )
-    return {"ra": ra % 360.0, "dec": dec}, keep, rounding
-
-
-def _angle(column, label, name):
-    """Degrees, or what the column has without a unit; and where there is no number."""
-    unit = unit_of(column)
-    try:
-        values, unreadable = read_numbers(column)
-    except ValueError as problem:
-        values = _sexagesimal(column, unit, label)
-        if values is None:
-            raise CatalogError(f"{name}: column {label!r} {problem}") from None
-        return values, np.isnan(values)
-    if unit is None:
-        return values, unreadable
-    try:
-        return convert(values, unit, u.deg), unreadable
-    except ValueError:
-        given = str(getattr(column, "unit", unit))
-        raise CatalogError(
-            f"{name}: unit of column {label!r} must be an angle, got {given!r}"
-        ) from None
-
-
-def _sexagesimal(column, unit, label):
-    """Degrees from ``10:00:00.5`` or ``10 00 00.5``: hours in right ascension; or `None`."""
-    text = read_text(column)
-    good = np.array([bool(_SEXAGESIMAL.fullmatch(t)) for t in text.tolist()], bool)
-    if not good.any():
-        return None
-    hours = not label.lower().lstrip("_").startswith(("d", "b")) and unit != u.deg
-    values = np.full(len(text), np.nan)
-    values[good] = Angle(text[good].tolist(), unit=u.hourangle if hours else u.deg).deg
-    return values
-
-
-_SEXAGESIMAL = re.compile(r"[-+]?\d{1,3}[: hd]\s*[0-5]?\d[: m'](\s*[0-5]?\d(\.\d*)?[s\"]?)?")
-
-
-def _radians_to_degrees(table, pair, values, name):
-    """Degrees per unit of positions without a unit, which may be radians."""
-    if any(unit_of(table[column]) is not None for column in pair):
-        return 1.0
-    ra, dec = values
-    known = np.isfinite(ra) & np.isfinite(dec)
-    ra, dec = ra[known], dec[known]
-    named = pair[0].lower() in _RADIANS
-    in_range = np.all(np.abs(ra) <= 2 * np.pi) and np.all(np.abs(dec) <= np.pi / 2)
-    if not in_range or len(ra) < (1 if named else _CROWD):
-        return 1.0
-    side = max(np.ptp(ra) * np.cos(np.radians(np.median(dec))), np.ptp(dec), 1e-9)
-    density = len(ra) / side**2
-    if density > (_DENSE if named else _TOO_DENSE):
-        warnings.warn(
-            f"{name}: columns {pair[0]!r} and {pair[1]!r} have no unit and are taken for radians: "
-            f"as degrees, they would have {density:.2g} stars per square degree",
-            WPDCWarning,
-        )
-        return 180.0 / np.pi
-    if named:
-        raise CatalogError(
-            f"{name}: columns {pair[0]!r} and {pair[1]!r} must have a unit: without, they may be "
-            f"degrees or radians ({ra[0]:g}, {dec[0]:g} in the first row)"
-        )
-    return 1.0
 
 
 def _optional(table, column, unit, name):
@@ -496,101 +333,3 @@ def _colors(table, spelled, name):
         return color
     blue, red = bands
     return blue - red if color is None else np.where(np.isnan(color), blue - red, color)
-
-
-def _to_icrs(columns, keep, meta, name):
-    """Turn positions of an old system, where the metadata name one, to ICRS."""
-    words = [str(meta.get(k, "")) for k in ("RADESYS", "RADECSYS", "radesys", "COOSYS", "system")]
-    system = next((_OLD_SYSTEMS[w.strip().upper()] for w in words if _is_old(w)), None)
-    if system is None:
-        return
-    if {"pmra", "pmdec"} & set(columns):
-        raise CatalogError(
-            f"{name}: catalogue must be in ICRS or FK5 to have proper motions, is in "
-            f"{system.upper()}"
-        )
-    sky = SkyCoord(columns["ra"][keep], columns["dec"][keep], unit="deg", frame=system).icrs
-    columns["ra"][keep], columns["dec"][keep] = sky.ra.deg, sky.dec.deg
-    log.info("%s: positions are turned from %s to ICRS", name, system.upper())
-
-
-def _is_old(word):
-    return word.strip().upper() in _OLD_SYSTEMS
-
-
-def _identifiers(table, spelled):
-    """Whole numbers that name the stars, or `None`."""
-    if "source_id" not in spelled:
-        return None
-    column = table[spelled["source_id"]]
-    values = np.ma.getdata(column)
-    if np.asarray(values).dtype.kind not in "iu":
-        return None
-    mask = getattr(column, "mask", None)
-    return np.asarray(values) if mask is None else np.where(mask, 0, np.asarray(values))
-
-
-def _one_of_each(columns, keep, identifiers, name):
-    """Mark one row for each star among those that are kept."""
-    part = {c: v[keep] for c, v in columns.items()}
-    n = len(part["ra"])
-    ra, dec = _at_one_epoch(part)
-    points = np.stack(directions(ra, dec)[0], axis=1)
-    links = None
-    if identifiers is not None:
-        links = _same_identifier(identifiers[keep], points)
-    errors = None
-    if "ra_error" in part and "dec_error" in part:
-        errors = np.hypot(part["ra_error"], part["dec_error"]) / np.sqrt(2) * _MAS
-    star = group_copies(
-        points,
-        reach=_COPY_REACH * 1e3 * _MAS,
-        errors=errors,
-        mag=part.get("phot_g_mean_mag"),
-        links=links,
-    )
-    known = np.zeros(n)
-    for column in ("pmra", "pmdec", "phot_g_mean_mag", "parallax"):
-        if column in part:
-            known += np.isfinite(part[column])
-    rank = np.nan_to_num(errors, nan=np.inf) if errors is not None else np.zeros(n)
-    order = np.lexsort((np.arange(n), rank, -known, star))
-    first = np.concatenate([[True], star[order][1:] != star[order][:-1]])
-    best = np.zeros(n, bool)
-    best[order[first]] = True
-    if not best.all():
-        again = np.flatnonzero(~best)
-        warnings.warn(
-            f"{name}: {len(again)} of {n} rows are further rows of a star that is there already "
-            f"(RA {part['ra'][again[0]]:.6f} Dec {part['dec'][again[0]]:.6f} deg for one): one row "
-            "of each star is kept",
-            WPDCWarning,
-        )
-    return best
-
-
-_MAS = np.pi / 180.0 / 3.6e6
-
-
-def _at_one_epoch(part):
-    """Positions at one epoch, where rows differ in theirs and have motions."""
-    ra, dec = part["ra"], part["dec"]
-    if not {"pmra", "pmdec", "ref_epoch"} <= set(part) or np.ptp(part["ref_epoch"]) == 0:
-        return ra, dec
-    years = np.nanmedian(part["ref_epoch"]) - part["ref_epoch"]
-    known = np.isfinite(years * part["pmra"] * part["pmdec"])
-    ra, dec = ra.copy(), dec.copy()
-    ra[known], dec[known] = move(
-        ra[known], dec[known], part["pmra"][known], part["pmdec"][known], years[known]
-    )[:2]
-    return ra, dec
-
-
-def _same_identifier(identifiers, points):
-    """Pairs of rows of one identifier; none where identifiers do not tell stars apart."""
-    order = np.argsort(identifiers, kind="stable")
-    i, j = order[:-1], order[1:]
-    same = (identifiers[i] == identifiers[j]) & (identifiers[i] > 0)
-    i, j = i[same], j[same]
-    near = np.linalg.norm(points[i] - points[j], axis=1) <= 2 * _COPY_REACH * 1e3 * _MAS
-    return (i[near], j[near]) if 2 * near.sum() > len(near) else (i[:0], j[:0])
