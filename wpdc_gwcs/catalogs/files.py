@@ -73,7 +73,7 @@ def split_extension(path):
     if found is None or Path(text).exists():
         return Path(text), None
     extension = found[2].strip()
-    return Path(found[1]), int(extension) if extension.isdigit() else extension
+    return Path(found[1]), int(extension) if re.fullmatch("[0-9]{1,9}", extension) else extension
 
 
 def is_fits(path):
@@ -114,7 +114,8 @@ def read_table_file(path, format=None):
     one of READ_ERRORS
         If the file cannot be read.
     """
-    path = Path(path)
+    # Absolute, since a leading '~' is not a name to astropy.
+    path = Path(path).absolute()
     text_format = format is not None and format.startswith("ascii")
     if format is not None and not text_format:
         return Table.read(path, format=format)
