@@ -41,7 +41,8 @@ def chip_of(path):
     """The header's WCS on a whole chip, and the degree of its polynomial."""
     from dataclasses import replace
 
-    from wpdc_gwcs.io.headers import parse_tan, read_headers
+    from wpdc_gwcs.io.headers import read_headers
+    from wpdc_gwcs.io.tan import parse_tan
 
     tan = parse_tan(next(h for h in read_headers(path) if h["CTYPE1"].endswith("TPV")))
     crpix = [-g if c < 0 else n + g for c, g, n in zip(tan.crpix, GAP, SHAPE[::-1])]

@@ -45,6 +45,11 @@ class Case:
             source="night/fake.fits",
             image_shape=SHAPE,
             epoch=2016.0,
+            sources=Table(
+                {"x": np.append(x, np.full(60, 5.0)), "y": np.append(y, np.full(60, 5.0))}
+            ),
+            usable=np.arange(N + 60) < N + 30,
+            pairs=(np.arange(N), np.arange(N)),
             reference=Table({"ra": [1.0], "dec": [2.0], "pmra": [3.0], "pmdec": [4.0]}),
             diagnostics=SimpleNamespace(
                 completeness=0.9, n_pairs=N, n_sources=N + 30, n_reference=N + 400
@@ -102,6 +107,28 @@ class TestCoverage:
 
     def test_of_stars_all_over(self, rng):
         assert coverage(rng.uniform(0, 1000, 2000), rng.uniform(0, 800, 2000), SHAPE) > 0.95
+
+
+class TestFewDetections:
+    def test_most_left_out(self, case, rng):
+        many = rng.uniform(0, 799, 1500)
+        case.frame.sources = Table({"x": many, "y": many})
+        case.frame.usable = np.arange(1500) < N + 30
+        case.frame.diagnostics.n_reference = 1300
+        (reason,) = case.lacks()
+        assert reason.startswith("300 of 1500 detections match, 1170 are left out")
+
+    def test_few_of_the_brightest(self, case):
+        sources = case.frame.sources
+        # Fewer reference stars than clean detections, and the pairs are of the faint ones.
+        case.frame.diagnostics.n_reference = 200
+        case.frame.diagnostics.n_pairs = 100
+        case.frame.pairs = np.arange(100), np.arange(100)
+        sources["flux"] = np.arange(len(sources), dtype=float)
+        (reason,) = case.lacks()
+        assert reason.startswith("0 of the 200 brightest of 330 clean detections match")
+        sources["flux"] = -sources["flux"]
+        assert case.lacks() == []
 
 
 class TestContradictions:
@@ -178,7 +205,7 @@ class TestShortcomings:
     def test_no_epoch(self, case):
         case.frame.epoch = None
         (reason,) = case.lacks()
-        assert reason == "the frame has no epoch: the stars' motions could not be applied"
+        assert reason == "the frame has no epoch: the stars' motions could not be applied (--epoch)"
         case.frame.reference.remove_columns(["pmra", "pmdec"])
         assert case.lacks() == []
 

@@ -1,5 +1,6 @@
 """Frames: images, source lists and tables, and every kind of input that is none."""
 
+import contextlib
 import gzip
 import os
 import pickle
@@ -8,12 +9,15 @@ import warnings
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import Table, vstack
 from astropy.wcs import WCS
+from astropy.wcs.utils import proj_plane_pixel_scales
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
 from wpdc_gwcs.io import read_frames
-from wpdc_gwcs.io.frames import standardize_sources
+from wpdc_gwcs.io.sources import standardize_sources
 
 
 def tan_header(**cards):
@@ -463,7 +467,7 @@ def test_flags_of_sextractor():
 
 
 def test_apertures_give_the_first():
-    columns = {"X_IMAGE": np.ones(2), "Y_IMAGE": np.ones(2)}
+    columns = {"X_IMAGE": np.array([1.0, 9.0]), "Y_IMAGE": np.ones(2)}
     columns |= {"FLUX_APER": np.array([[1.0, 2.0], [3.0, 4.0]]), "FLUXERR_APER": np.ones((2, 2))}
     assert standardize_sources(columns)["snr"].tolist() == [1.0, 3.0]
 
@@ -497,6 +501,140 @@ def test_one_based_table(tmp_path, wcs_file):
     Table({"X_IMAGE": [1.0], "Y_IMAGE": [2.0]}).write(tmp_path / "s.ecsv")
     (frame,) = read_frames(tmp_path / "s.ecsv", wcs=wcs_file)
     assert frame.load_sources()["y"][0] == 1.0
+
+
+DAOFIND = """#K IRAF       = NOAO/IRAFV2.16          version    %-23s
+#K PROGRAM    = daofind                 task       %-23s
+#
+#N XCENTER   YCENTER   MAG      SHARPNESS   ID         \\
+#U pixels    pixels    #        #           #          \\
+#F %-13.3f   %-10.3f   %-9.3f   %-12.3f     %-6d       \\
+#
+   12.345     20.567   -2.345   0.534       1
+   32.345     10.567   -1.345   0.634       2
+"""
+ALLSTAR = """ NL    NX    NY  LOWBAD HIGHBAD  THRESH     AP1  PH/ADU  RNOISE    FRAD
+  1    60    40   -50.0 30000.0   10.00    4.00    1.50    3.00   12.00
+
+     1   12.345   20.567   14.123   0.0123   120.5       4.    1.023    0.012
+     2   32.345   10.567   15.123   0.0223   120.5       4.    1.023    0.012
+"""
+PHOTOMETRY = """ NL    NX    NY  LOWBAD HIGHBAD  THRESH     AP1  PH/ADU  RNOISE    FRAD
+  2    60    40   -50.0 30000.0   10.00    4.00    1.50    3.00   12.00
+
+
+     1   12.345   20.567   14.123
+       120.5  4.11  0.02  0.0123
+
+     2   32.345   10.567   15.123
+       120.5  4.11  0.02  0.0223
+"""
+TOLD = "# {}\nx y mag\n12.345 20.567 14.1\n32.345 10.567 15.1\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "first"),
+    [
+        (DAOFIND, 1),
+        (ALLSTAR, 1),
+        (PHOTOMETRY, 1),
+        (TOLD.format("positions are 1-based"), 1),
+        (TOLD.format("pixel coordinates start at 1"), 1),
+        (TOLD.format("origin = 1"), 1),
+        (TOLD.format("FITS convention: first pixel is (1, 1)"), 1),
+        (TOLD.format("made by photutils, zero-indexed"), 0),
+        (TOLD.format("origin: 0"), 0),
+    ],
+)
+def test_lists_that_tell_their_first_pixel(tmp_path, wcs_file, text, first):
+    (tmp_path / "s.txt").write_text(text)
+    (frame,) = read_frames(tmp_path / "s.txt", wcs=wcs_file)
+    assert frame.meta["first_pixel"] == str(first)
+    sources = frame.load_sources()
+    assert sources["x"].tolist() == pytest.approx([12.345 - first, 32.345 - first])
+    assert sources["flux"][0] > sources["flux"][1]
+    # What is said by hand holds.
+    (frame,) = read_frames(tmp_path / "s.txt", wcs=wcs_file, origin=1 - first)
+    assert frame.load_sources()["x"][0] == pytest.approx(12.345 - (1 - first))
+
+
+def test_list_that_tells_nothing(tmp_path, wcs_file):
+    (tmp_path / "s.txt").write_text(TOLD.format("four chips, numbered from 1"))
+    (frame,) = read_frames(tmp_path / "s.txt", wcs=wcs_file)
+    assert frame.meta["first_pixel"] == "0, since nothing tells"
+    assert frame.load_sources()["x"][0] == 12.345
+
+
+@pytest.mark.parametrize(
+    ("cards", "first"),
+    [
+        ({"AN_FILE": "XYLS"}, 1),
+        ({"COMMENT": "x, y count from 1"}, 1),
+        ({"PIXORIG": 1}, 1),
+        ({"ORIGIN": "NOAO-IRAF FITS Image Kernel"}, 0),
+        ({}, 0),
+    ],
+)
+def test_fits_lists_that_tell_their_first_pixel(tmp_path, wcs_file, cards, first):
+    table = fits.table_to_hdu(Table({"X": [12.5, 30.0], "Y": [20.0, 10.0], "FLUX": [2.0, 1.0]}))
+    fits.HDUList([fits.PrimaryHDU(header=fits.Header(cards)), table]).writeto(tmp_path / "s.axy")
+    (frame,) = read_frames(tmp_path / "s.axy", wcs=wcs_file)
+    assert frame.load_sources()["x"][0] == 12.5 - first
+    (frame,) = read_frames(tmp_path / "s.axy", wcs=wcs_file, origin=0)
+    assert frame.load_sources()["x"][0] == 12.5
+
+
+def test_given_by_hand(tmp_path, wcs_file):
+    Table({"x": [0.5, 59.0], "y": [1.0, 2.0]}).write(tmp_path / "s.ecsv")
+    (frame,) = read_frames(tmp_path / "s.ecsv", wcs=wcs_file, epoch=2001.5, pixel_scale=0.4)
+    assert frame.epoch == 2001.5
+    assert proj_plane_pixel_scales(frame.wcs)[0] * 3600 == pytest.approx(0.4)
+    for options in ({"origin": 2}, {"pixel_scale": 0.0}, {"pixel_scale": float("nan")}):
+        with pytest.raises(ValueError, match="must be"):
+            read_frames(tmp_path / "s.ecsv", wcs=wcs_file, **options)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.02, 0.4])
+def test_sources_that_are_there_twice(rng, offset):
+    n = 300
+    table = Table({"x": rng.uniform(0, 2000, n), "y": rng.uniform(0, 2000, n)})
+    table["flux"] = rng.uniform(1, 100, n)
+    again = table[100:].copy()
+    again["x"] += offset
+    with pytest.warns(WPDCWarning, match="200 of 500 rows are further rows of a source"):
+        sources = standardize_sources(vstack([table, again]))
+    assert len(sources) == 500
+    assert np.flatnonzero(np.isfinite(sources["x"])).tolist() == list(range(n))
+
+
+def test_cells_that_are_no_numbers():
+    table = {"x": ["1.0", "bad", "3.0"], "y": [1.0, 2.0, 9.0], "snr": ["a", "b", "c"]}
+    with (
+        pytest.warns(WPDCWarning, match="1 of 3 rows are left out: column 'x' .*'bad' in row 1"),
+        pytest.warns(WPDCWarning, match="column 'snr' must be numeric, got 'a': it is left out"),
+    ):
+        sources = standardize_sources(table)
+    np.testing.assert_array_equal(sources["x"], [1.0, np.nan, 3.0])
+    assert sources.colnames == ["x", "y"]
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    st.lists(
+        st.sampled_from(["x", "Y", "y", "flux", "snr", "FLAGS", "x_err", "y_err", "ELONGATION"]),
+        unique=True,
+    ),
+    st.data(),
+)
+def test_no_other_error_whatever_the_list(names, data):
+    cells = st.one_of(st.floats(), st.integers(-(2**60), 2**60), st.text(max_size=8), st.none())
+    table = {
+        name: np.array(data.draw(st.lists(cells, min_size=3, max_size=3)), dtype=object)
+        for name in names
+    }
+    with contextlib.suppress(FrameError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        standardize_sources(table)
 
 
 def test_table_that_brings_its_header(tmp_path):

@@ -1,5 +1,6 @@
 """Headers: every form of the same WCS against astropy.wcs, dates, and what is refused."""
 
+import contextlib
 import copy
 import warnings
 
@@ -13,18 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wpdc_gwcs.exceptions import FileFormatError, FrameError, WPDCWarning
-from wpdc_gwcs.io import read_wcs
-from wpdc_gwcs.io.dates import header_epoch
+from wpdc_gwcs.io import read_frames, read_wcs
+from wpdc_gwcs.io.celestial import parse_wcs
+from wpdc_gwcs.io.dates import header_epoch, header_start, read_epoch
 from wpdc_gwcs.io.headers import (
     clean_header,
-    fold_attitude,
     header_number,
     header_shape,
-    parse_tan,
-    parse_wcs,
     positive_number,
     read_headers,
 )
+from wpdc_gwcs.io.tan import fold_attitude, parse_tan
 from wpdc_gwcs.models import PVPolynomial, project, pv_terms
 
 
@@ -293,7 +293,10 @@ class TestRefused:
         header = tpv_header()
         for key in list(header["CD*"]):
             del header[key]
-        with pytest.raises(FileFormatError, match="card CDELT1 is missing"):
+        with pytest.raises(FileFormatError, match="scale of the pixels in CD, PC"):
+            parse_tan(header)
+        header["CDELT1"] = 1e-4
+        with pytest.raises(FileFormatError, match="card CDELT2 is missing"):
             parse_tan(header)
 
     def test_units(self):
@@ -331,6 +334,11 @@ class TestRefused:
         ({"EQUINOX": 1950.0}, "fk4"),
         ({"RADECSYS": "FK5", "EQUINOX": "J2000"}, "icrs"),
         ({"RADESYS": "ICRS"}, "icrs"),
+        ({"RADESYS": "GAIA-CRF3", "EQUINOX": 2016.0}, "icrs"),
+        ({"RADESYS": "FK4-NO-E"}, "fk4noeterms"),
+        ({"RADESYS": "fk4_no_e", "EQUINOX": "B1950.0"}, "fk4noeterms"),
+        ({"RADESYS": "J2000"}, "icrs"),
+        ({"RADESYS": "UNKNOWN"}, "icrs"),
         ({}, "icrs"),
     ],
 )
@@ -339,10 +347,72 @@ def test_starting_wcs_is_in_icrs(cards, frame):
     wcs = parse_wcs(header)
     ra, dec = wcs.pixel_to_world_values(10.0, 2000.0)
     raw = read_wcs(header)(10.0, 2000.0)
-    options = {"fk4": {"equinox": "B1950"}, "fk5": {"equinox": "J1975"}}.get(frame, {})
+    options = {"fk5": {"equinox": "J1975"}}.get(frame, {})
+    options = {"equinox": "B1950"} if frame.startswith("fk4") else options
     expected = SkyCoord(*raw, unit="deg", frame=frame, **options).icrs
     # FK4's terms of aberration are not a rotation; over a frame they leave some 0.01 arcsec.
     assert SkyCoord(ra, dec, unit="deg").separation(expected).arcsec < 0.03
+
+
+@pytest.mark.parametrize("system", ["GAPPT", "Apparent", "TETE", "true-of-date"])
+def test_apparent_places_are_those_of_their_equinox(system):
+    header = tpv_header(RADESYS=system, EQUINOX=2016.5)
+    with pytest.warns(WPDCWarning, match=f"{system}'.*taken for mean places of 2016.5"):
+        wcs = parse_wcs(header)
+    got = SkyCoord(*wcs.pixel_to_world_values(10.0, 2000.0), unit="deg")
+    raw = read_wcs(tpv_header())(10.0, 2000.0)
+    expected = SkyCoord(*raw, unit="deg", frame="fk5", equinox="J2016.5").icrs
+    assert got.separation(expected).arcsec < 1e-6
+    with pytest.raises(FileFormatError, match="needs the EQUINOX"):
+        parse_wcs(tpv_header(RADESYS=system))
+
+
+def test_unknown_system_is_named():
+    with pytest.warns(WPDCWarning, match="got 'XYZ': it is taken for FK5 of 1990.0"):
+        parse_wcs(tpv_header(RADESYS="XYZ", EQUINOX=1990.0))
+
+
+def test_warning_of_an_open_file_is_shown(tmp_path):
+    fits.PrimaryHDU(np.zeros((9, 9)), tpv_header(RADESYS="XYZ")).writeto(tmp_path / "a.fits")
+    with pytest.warns(WPDCWarning, match="a.fits: RADESYS must be ICRS"):
+        read_frames(tmp_path / "a.fits")
+
+
+@pytest.mark.parametrize("cards", [{"PV2_1": 0.0, "PV2_2": 0}, {"PV1_1": 0.0}])
+def test_zeros_beside_tan_say_nothing(cards):
+    header = tpv_header(code="TAN")
+    for key in list(header["PV*"]):
+        del header[key]
+    plain = parse_tan(header)
+    header.update(cards)
+    zeros = parse_tan(header)
+    np.testing.assert_array_equal(zeros.pv.coefficients, plain.pv.coefficients)
+    assert deviation(header, parse_wcs(header)) < 1e-6
+
+
+def test_scale_is_one_beside_pc():
+    header = tpv_header()
+    for i in (1, 2):
+        for j in (1, 2):
+            header[f"PC{i}_{j}"] = header.pop(f"CD{i}_{j}")
+    np.testing.assert_array_equal(parse_tan(header).cd, parse_tan(tpv_header()).cd)
+
+
+@pytest.mark.parametrize("code", ["TPV", "SIN"])
+def test_pixel_scale_by_hand(code):
+    header = tpv_header(code=code)
+    if code == "SIN":
+        for key in list(header["PV*"]):
+            del header[key]
+    scaled = parse_wcs(header, pixel_scale=0.5)
+    matrix = scaled.pixel_scale_matrix
+    assert np.sqrt(abs(np.linalg.det(matrix))) == pytest.approx(0.5 / 3600, rel=1e-12)
+    ratio = matrix / parse_wcs(header).pixel_scale_matrix
+    np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-12)
+    for key in list(header["CD*"]):
+        del header[key]
+    matrix = parse_wcs(header, pixel_scale=0.5).pixel_scale_matrix
+    np.testing.assert_allclose(matrix, np.diag([-0.5, 0.5]) / 3600, rtol=1e-12)
 
 
 def test_galactic_axes():
@@ -357,6 +427,36 @@ def test_galactic_axes():
     assert list(wcs.wcs.ctype) == ["RA---TAN", "DEC--TAN"]
     got = SkyCoord(*wcs.pixel_to_world_values(10, 2000), unit="deg")
     assert got.separation(expected).arcsec < 1e-6
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    st.dictionaries(
+        st.sampled_from(
+            "CTYPE1 CTYPE2 CRVAL1 CRVAL2 CRPIX1 CD1_1 CD1_2 CD2_1 CDELT1 CDELT2 PC1_1 CROTA2 "
+            "CUNIT1 RADESYS EQUINOX EPOCH LONPOLE LATPOLE PV1_1 PV2_1 PV1_5 A_ORDER NAXIS1 NAXIS2 "
+            "DATE-OBS MJD-OBS EXPTIME TIMESYS OBSMJD WCSAXES".split()
+        ),
+        st.one_of(
+            st.sampled_from(["RA---TAN", "DEC--TAN", "RA---SIP", "GLON-CAR", "FK4", "ICRS", "deg"]),
+            st.floats(allow_nan=False, allow_infinity=False),
+            st.integers(-10, 10),
+            st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=20),
+            st.booleans(),
+        ),
+        max_size=6,
+    )
+)
+def test_no_other_error_whatever_the_header(cards):
+    header = tpv_header(code="TAN")
+    for key, value in cards.items():
+        header[key] = value
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with contextlib.suppress(FileFormatError):
+            parse_wcs(header)
+        header_epoch([header])
+        header_start([header])
 
 
 # --- text ---------------------------------------------------------------------------------------
@@ -478,6 +578,103 @@ def test_primary_header_comes_second():
     primary = fits.Header({"DATE-OBS": "2001-01-01T00:00:00", "EXPTIME": 0.0})
     assert epoch(primary, MJD_OBS=57388.5) == pytest.approx(2016.0, abs=1e-3)
     assert epoch(primary) == pytest.approx(2001.0, abs=2e-3)
+
+
+NOON = Time("2020-09-24T10:21:45", scale="utc")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *((key, NOON.mjd) for key in ("OBSMJD", "MJD_OBS", "EXPSTART", "MJD-STRT", "MJDSTART")),
+        *((key, NOON.mjd) for key in ("MJD_UTC", "SHUTOPEN", "OBS-MJD", "TAI-MJD", "MJD-MID")),
+        *(
+            (key, NOON.jd)
+            for key in ("OBSJD", "JD-OBS", "JD_UTC", "JDSTART", "HJD", "JULDATE", "JD")
+        ),
+        *((key, NOON.isot) for key in ("DATE_OBS", "SHUTOPEN", "DATEOBS", "UTDATE", "OBS-DATE")),
+        *((key, NOON.isot) for key in ("DATE_BEG", "EXPSTART", "UTC-OBS", "OBSTIME", "TIME-BEG")),
+        *((key, NOON.isot) for key in ("DATE-UTC", "TIMESTAMP", "MIDTIME", "OBSTART", "UTSHUT")),
+        ("ESO OBS START", NOON.isot),
+        ("XYZ EXP MJD-OBS", NOON.mjd),
+        ("MJD-OBS", NOON.jd),
+        ("JD", str(NOON.jd)),
+        ("OBSEPOCH", NOON.tt.jyear),
+    ],
+)
+def test_keywords_of_observatories(key, value):
+    header = fits.Header()
+    header.set(f"HIERARCH {key}" if len(key) > 8 else key, value)
+    assert header_epoch([header]) == pytest.approx(NOON.tt.jyear, abs=3e-6)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2020-09-24T10:21:45Z",
+        "2020-09-24T10:21:45+00:00",
+        "2020-09-24T12:21:45+0200",
+        "2020-09-24T10:21:45.000(UTC)",
+        "2020-09-24 10:21:45 UTC",
+        "2020-09-24 10:21:45 UT",
+        "2020/09/24 10:21:45",
+        "2020:09:24 10:21:45",
+        "2020.09.24 10:21:45",
+        "2020-9-24T10h21m45s",
+        "20200924T102145",
+        "24/09/2020 10:21:45",
+        "24-09-2020T10:21:45",
+        "09/24/2020 10:21:45 AM",
+        "24/09/20 10:21:45",
+        "24 Sep 2020 10:21:45",
+        "24-SEP-2020 10:21:45",
+        "September 24, 2020 10:21:45",
+        "2020-Sep-24 10:21:45",
+        "Thu Sep 24 10:21:45 2020",
+        "Thursday, 24 September 2020 10:21:45 GMT",
+        "2020:268:10:21:45",
+        "2020-268T10:21:45",
+        "2020-09-24T10:22:22(TAI)",
+    ],
+)
+def test_forms_of_dates(text):
+    header = fits.Header({"DATE-OBS": text})
+    assert header_epoch([header]) == pytest.approx(NOON.tt.jyear, abs=5e-8)
+    assert header_start([header]) == pytest.approx(NOON.mjd, abs=5e-4)
+
+
+@pytest.mark.parametrize("text", ["2020/09/24", "24/09/2020", "20200924", "24-Sep-20", "2020-268"])
+def test_days_without_time(text):
+    header = fits.Header({"DATE-OBS": text})
+    assert header_epoch([header]) == pytest.approx(NOON.tt.jyear, abs=0.5 / 365)
+    assert header_start([header]) is None
+    header["UT"] = "10:21:45"
+    assert header_epoch([header]) == pytest.approx(NOON.tt.jyear, abs=5e-8)
+
+
+@pytest.mark.parametrize(
+    "cards",
+    [
+        {"DATE": "2024-01-01T00:00:00", "DATE-MAP": "2024-01-01", "MJDREF": 55197.0},
+        {"UTSTART": 50000.0, "EXPTIME": 50000.0, "EXP": 50001, "INT": 50002, "FRAME": 50003.0},
+        {"DATE-PRC": "2024-01-01", "PROCTIME": "2024-01-01", "CALDATE": "2024-01-01"},
+        {"UT": "10:21:45", "TIME-OBS": "10:21:45", "LST": "10:21:45", "EQUINOX": 2000.0},
+    ],
+)
+def test_what_is_no_date_of_the_exposure(cards):
+    assert header_epoch([fits.Header(cards)]) is None
+    cards = {"OBSMJD": NOON.mjd, **cards, "EXPTIME": 0.0}
+    assert header_epoch([fits.Header(cards)]) == pytest.approx(NOON.tt.jyear, abs=3e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "year"), [("J2016.5", 2016.5), ("2016-07-02", 2016.5), (57571.5, 2016.5)]
+)
+def test_epoch_by_hand(text, year):
+    assert read_epoch(text) == pytest.approx(year, abs=2e-3)
+    for bad in ("soon", "12", "nan", "2016-13-01", ""):
+        with pytest.raises(ValueError, match="epoch must be a Julian year"):
+            read_epoch(bad)
 
 
 def test_no_date():

@@ -39,9 +39,11 @@ def match(sky, tmp_path):
             wcs.wcs.cd = wcs.wcs.cd @ cd
         header = wcs.to_header()
         header.update(NAXIS=2, NAXIS1=SIDE, NAXIS2=SIDE)
-        fits.PrimaryHDU(np.zeros((SIDE, SIDE), np.uint8), header).writeto(tmp_path / "h.fits")
-        (sky[1] if sources is None else sources).write(tmp_path / "sources.ecsv")
-        (sky[2] if catalog is None else catalog).write(tmp_path / "catalog.ecsv")
+        fits.PrimaryHDU(np.zeros((SIDE, SIDE), np.uint8), header).writeto(
+            tmp_path / "h.fits", overwrite=True
+        )
+        (sky[1] if sources is None else sources).write(tmp_path / "sources.ecsv", overwrite=True)
+        (sky[2] if catalog is None else catalog).write(tmp_path / "catalog.ecsv", overwrite=True)
         files = {"--wcs": "h.fits", "--catalog": "catalog.ecsv", "--output": "pairs.ecsv"}
         named = [str(v) for name, file in files.items() for v in (name, tmp_path / file)]
         return run(["match", str(tmp_path / "sources.ecsv"), *named, *options])
@@ -75,9 +77,19 @@ def test_writes_pairs_and_evidence(match, sky, tmp_path, capsys):
     assert evidence["purity"] > 0.99
     assert evidence["completeness"] > 0.95
     assert evidence["n_ambiguous"] < 5
-    said = capsys.readouterr().out
-    assert f"{len(pairs)} pairs" in said
-    assert "expected by chance" in said
+    said = capsys.readouterr()
+    assert f"{len(pairs)} pairs" in said.out
+    assert "expected by chance" in said.out
+    assert "the first pixel was taken for 0 (--origin 1 if it is 1)" in said.err
+
+
+def test_what_is_given_by_hand(match, tmp_path, capsys):
+    assert match("--origin", "1", "--epoch", "2016-07-02", "--overwrite") == 0
+    assert "--origin" not in capsys.readouterr().err
+    assert match("--origin", "0", "--overwrite") == 0
+    for option, value in (("--origin", "2"), ("--epoch", "soon"), ("--pixel-scale", "-1")):
+        assert match(option, value, "--overwrite") == 2
+        assert f"{option} must be" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

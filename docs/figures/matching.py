@@ -21,14 +21,15 @@ from wpdc_gwcs.calibration import measure_sources
 from wpdc_gwcs.calibration.start import detector_center, linear_wcs, sky_of
 from wpdc_gwcs.catalogs import propagate, read_catalog
 from wpdc_gwcs.io import read_frames
-from wpdc_gwcs.matching import match_planes, pair_nearest, select_sources
-from wpdc_gwcs.matching._core import prepare_search
+from wpdc_gwcs.matching import MatchOptions, match_planes, pair_nearest, select_sources
 from wpdc_gwcs.matching._features import (
     N_NEIGHBOURS,
     density_ratio_map,
     neighbour_pattern,
 )
-from wpdc_gwcs.matching._search import Stars, first_pairs
+from wpdc_gwcs.matching._growth import fit_pairs, grow_locally, grow_once
+from wpdc_gwcs.matching._hypotheses import count_neighbours, find_groups, first_pairs
+from wpdc_gwcs.matching._problem import Stars, prepare_problem
 
 # Okabe and Ito's colours, told apart with any colour vision.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
@@ -63,20 +64,20 @@ class Stages:
             "y_err": np.asarray(self.all["y_err"], float)[self.use],
         }
         planes = self.xs, self.ys, self.xr, self.yr
-        self.search = prepare_search(*planes, **options)
+        self.problem = prepare_problem(*planes, **options, options=MatchOptions())
         self.i, self.j, self.diagnostics = match_planes(*planes, **options)
         self.truth = dict(
             zip(
-                np.searchsorted(self.search.source_rows, self.i),
-                np.searchsorted(self.search.reference_rows, self.j),
+                np.searchsorted(self.problem.source_rows, self.i),
+                np.searchsorted(self.problem.reference_rows, self.j),
                 strict=True,
             )
         )
-        self.sources = Stars.build(self.search.sources)
-        self.reference = self.search.stars
-        self.n_near = self.search.neighbourhood(self.sources, self.reference, N_NEIGHBOURS)
-        self.hypotheses, self.groups = self.search.seeds(
-            self.sources, self.reference, None, N_ANCHORS, N_NEIGHBOURS, 10**8
+        self.sources = Stars.build(self.problem.sources)
+        self.reference = self.problem.stars
+        self.n_near = count_neighbours(self.problem, self.sources, self.reference, N_NEIGHBOURS)
+        self.hypotheses, self.groups = find_groups(
+            self.problem, self.sources, self.reference, None, N_ANCHORS, N_NEIGHBOURS, 10**8
         )
 
     def is_right(self, i, j):
@@ -114,7 +115,7 @@ def draw_preparation(stages):
     left.set(xlim=(700, 1300), ylim=(700, 1300), xlabel="x (px)", ylabel="y (px)")
     left.set_title(f"{stages.use.sum()} of {len(stages.use)} sources (a part of the frame)")
     left.legend(loc="upper right", framealpha=0.95)
-    limits = stages.search.limits
+    limits = stages.problem.limits
     reach = limits.half_diagonal + limits.reach(limits.half_diagonal)
     points = stages.reference.points
     # every fifth, or the picture would be a blue disc
@@ -154,7 +155,7 @@ def draw_density(stages):
 
 def draw_features(stages):
     """One star, its right and a wrong candidate, and how their neighbours differ."""
-    search = stages.search
+    problem = stages.problem
     h = stages.hypotheses
     right_ones = np.flatnonzero(stages.is_right(h.source, h.reference))
     pick = right_ones[0]
@@ -207,8 +208,8 @@ def draw_features(stages):
                 fill=False, lw=2, color="k",
             )
         )  # fmt: skip
-        limit = search.limits.max_scale + search.limits.gradient
-        turn = search.limits.max_rotation + np.rad2deg(search.limits.gradient)
+        limit = problem.limits.max_scale + problem.limits.gradient
+        turn = problem.limits.max_rotation + np.rad2deg(problem.limits.gradient)
         panel.set(xlim=(-turn, turn), ylim=(-limit, limit))
         panel.set(xlabel=r"difference of $\theta$ (deg)", ylabel="difference of log d")
         panel.set_title(
@@ -251,7 +252,9 @@ def first_fit(stages):
             stages.sources, stages.reference, stages.hypotheses.take(rows), stages.n_near[0]
         )
     )
-    fit = stages.search.fit(stages.sources.points[pairs[0]], stages.reference.points[pairs[1]])
+    fit = fit_pairs(
+        stages.problem, stages.sources.points[pairs[0]], stages.reference.points[pairs[1]]
+    )
     return pairs, fit
 
 
@@ -287,18 +290,20 @@ def draw_clipping(stages):
 
 def draw_growth(stages):
     """From the first pairs of a single star to the frame, round by round, and the fine step."""
-    search = stages.search
+    problem = stages.problem
     h = stages.hypotheses
     at = np.flatnonzero(stages.is_right(h.source, h.reference))[:1]
     *_, pairs = first_pairs(stages.sources, stages.reference, h.take(at), stages.n_near[0])
     rounds = [(None, pairs, None, None)]
     points, limit = stages.sources.points, stages.sources.limit
     while len(rounds) < 25:
-        step = search.grow_once(points, limit, stages.reference, rounds[-1][1], search.max_order)
+        step = grow_once(
+            problem, points, limit, stages.reference, rounds[-1][1], problem.options.max_order
+        )
         rounds.append(step)
         if len(rounds) > 2 and len(step[1][0]) == len(rounds[-2][1][0]):
             break
-    fit, local, fine, _ = search.grow_locally(points, limit, rounds[-1][0], rounds[-1][1])
+    fit, local, fine, _ = grow_locally(problem, points, limit, rounds[-1][0], rounds[-1][1])
     shown = [0, 1, 2, len(rounds) - 1]
     figure = Figure(figsize=(9.6, 6.4), layout="constrained")
     panels = figure.subplots(2, 3).ravel()

@@ -7,6 +7,7 @@ degraded, with the reasons.
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.evaluation import binned_residuals
 from wpdc_gwcs.exceptions import FitError
 
@@ -42,6 +43,10 @@ _MAX_MAP_SIGMA, _UNCERTAIN_SHARE = 0.25, 0.05
 
 # Share of the matched stars that the fit uses, and of the stars of the shorter list that match.
 _MIN_USED, _MIN_COMPLETENESS = 0.7, 0.3
+
+# The same with all detections counted, also those that are flagged, not round or faint: where most
+# are, it is the measurement that is wrong, and right pairs are few by luck.
+_MIN_DETECTED = 0.25
 
 # Change of area by which a map may differ from its mean; beyond, it comes close to folding.
 _MIN_AREA, _MAX_AREA = 0.5, 2.0
@@ -153,8 +158,10 @@ def shortcomings(frame, calibration, *, held, known=False, stored=None):
             f"{match.n_pairs} of {match.n_sources} clean detections and {match.n_reference} "
             "reference stars on the frame match"
         )
+    else:
+        reasons += _few_detections(frame, match)
     if frame.epoch is None and "pmra" in frame.reference.colnames:
-        reasons.append("the frame has no epoch: the stars' motions could not be applied")
+        reasons.append("the frame has no epoch: the stars' motions could not be applied (--epoch)")
     low, high = calibration.solution.area_range
     if not (low >= _MIN_AREA and high <= _MAX_AREA):
         reasons.append(f"the map stretches the detector by {low:.2f} to {high:.2f} in area")
@@ -162,6 +169,31 @@ def shortcomings(frame, calibration, *, held, known=False, stored=None):
     if offset is not None:
         reasons.append(offset)
     return reasons
+
+
+def _few_detections(frame, match):
+    """Tell where few of all detections, or of the brightest clean ones, match."""
+    sources = frame.sources
+    detected = int(on_detector(sources["x"], sources["y"], frame.image_shape).sum())
+    if match.n_pairs < _MIN_DETECTED * min(detected, match.n_reference):
+        return [
+            f"{match.n_pairs} of {detected} detections match, {detected - match.n_sources} are "
+            f"left out (flagged, not round or faint); the catalogue has {match.n_reference} stars "
+            "on the frame"
+        ]
+    # A shallow catalogue has the bright stars: of the faint ones nobody knows.
+    clean = np.flatnonzero(frame.usable)
+    if "flux" not in sources.colnames or len(clean) <= match.n_reference:
+        return []
+    flux = np.nan_to_num(np.asarray(sources["flux"], float)[clean], nan=-np.inf)
+    bright = clean[np.argsort(-flux, kind="stable")[: match.n_reference]]
+    matched = int(np.isin(bright, frame.pairs[0]).sum())
+    if matched >= _MIN_COMPLETENESS * len(bright):
+        return []
+    return [
+        f"{matched} of the {len(bright)} brightest of {match.n_sources} clean detections match; "
+        "the catalogue has as many stars on the frame"
+    ]
 
 
 def coverage(x, y, image_shape):

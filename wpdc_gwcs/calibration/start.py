@@ -1,10 +1,12 @@
 """The linear tangent-plane WCS about a reference point that stands in for a header's WCS."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from wpdc_gwcs.models import deproject, project
+from wpdc_gwcs.detector import on_detector
+from wpdc_gwcs.models import deproject, local_plane, project
 
 __all__ = [
     "LinearWCS",
@@ -127,8 +129,7 @@ def header_reference_point(frame):
     if header is None:
         return center
     crpix = np.asarray(header.crpix, float)[:2] - 1
-    on_detector = -0.5 <= crpix[0] <= nx - 0.5 and -0.5 <= crpix[1] <= ny - 0.5
-    return crpix if on_detector else center
+    return crpix if on_detector(*crpix, frame.image_shape) else center
 
 
 def linear_wcs(wcs, crpix):
@@ -146,9 +147,5 @@ def linear_wcs(wcs, crpix):
     LinearWCS
         With the same sky position, scale and orientation at the point.
     """
-    crval = np.array(sky_of(wcs, *crpix[:, None])).ravel()
-    x = crpix[0] + np.array([1.0, -1.0, 0.0, 0.0])
-    y = crpix[1] + np.array([0.0, 0.0, 1.0, -1.0])
-    xi, eta = project(*sky_of(wcs, x, y), crval)
-    cd = 0.5 * np.array([[xi[0] - xi[1], xi[2] - xi[3]], [eta[0] - eta[1], eta[2] - eta[3]]])
+    crval, cd = local_plane(partial(sky_of, wcs), *crpix)
     return LinearWCS(crpix=crpix, cd=cd, crval=crval)

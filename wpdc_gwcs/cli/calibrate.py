@@ -13,13 +13,18 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import (
     Config,
+    Epoch,
     MinSNR,
+    Origin,
     Overwrite,
+    PixelScale,
     Preset,
     Quiet,
     Threshold,
     Verbose,
+    by_hand,
     require_plotting,
+    state_first_pixel,
 )
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.exceptions import InputError
@@ -63,6 +68,9 @@ def calibrate_command(
         str | None,
         typer.Option(metavar="NAME", help="Detector of all frames; default: from the headers."),
     ] = None,
+    epoch: Epoch = None,
+    pixel_scale: PixelScale = None,
+    origin: Origin = None,
     exposure_key: Annotated[
         str | None,
         typer.Option(
@@ -216,6 +224,7 @@ def calibrate_command(
         raise InputError(str(err)) from err
 
     keys = {"exposure_keyword": exposure_key, "camera": not no_camera}
+    keys |= by_hand(epoch, pixel_scale, origin)
     loaded = [f for path in frames for f in read_frames(path, wcs=wcs, detector=detector, **keys)]
     results = Results(output, loaded, overwrite=overwrite)
     if report:
@@ -241,6 +250,7 @@ def calibrate_command(
         print_summary(run, output)
         if update:
             print_changes(run)
+    state_first_pixel(loaded)
     for calibration in run.calibrations:
         if calibration.statistics["reasons"]:
             log.warning(

@@ -1,5 +1,6 @@
 """Options that several commands share, and the files and presets they may come from."""
 
+import logging
 import tomllib
 from importlib.resources import files
 from importlib.util import find_spec
@@ -13,15 +14,23 @@ from wpdc_gwcs.exceptions import InputError
 
 __all__ = [
     "Config",
+    "Epoch",
     "MinSNR",
+    "Origin",
     "Overwrite",
+    "PixelScale",
     "Preset",
     "Quiet",
     "Threshold",
     "Verbose",
+    "by_hand",
+    "state_first_pixel",
     "require_free",
     "require_plotting",
 ]
+
+
+log = logging.getLogger("wpdc_gwcs.cli")
 
 
 def preset_names():
@@ -126,6 +135,27 @@ MinSNR = Annotated[
     ),
 ]
 
+Epoch = Annotated[
+    str | None,
+    typer.Option(
+        metavar="DATE",
+        help="Epoch of the frames (Julian year, date or MJD), instead of the headers' dates.",
+    ),
+]
+
+PixelScale = Annotated[
+    float | None,
+    typer.Option(metavar="ARCSEC", help="Scale in arcsec / px, instead of the headers'."),
+]
+
+Origin = Annotated[
+    int | None,
+    typer.Option(
+        metavar="{0,1}",
+        help="Number of the first pixel in tables of sources; default: as they tell, else 0.",
+    ),
+]
+
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that are already there.")
 ]
@@ -138,6 +168,55 @@ Verbose = Annotated[
 Quiet = Annotated[
     bool, typer.Option("-q", "--quiet", help="Say nothing but errors.", callback=_quiet)
 ]
+
+
+def by_hand(epoch, pixel_scale, origin):
+    """Check what is given in place of headers.
+
+    Parameters
+    ----------
+    epoch : str or None
+        Epoch of the frames.
+    pixel_scale : float or None
+        Scale, arcsec / px.
+    origin : int or None
+        Number of the first pixel.
+
+    Returns
+    -------
+    dict
+        Keyword arguments of `wpdc_gwcs.io.read_frames`.
+    """
+    from wpdc_gwcs.io.dates import read_epoch
+
+    if origin not in (None, 0, 1):
+        raise InputError(f"--origin must be 0 or 1, got {origin}")
+    if pixel_scale is not None and not 0 < pixel_scale < float("inf"):
+        raise InputError(f"--pixel-scale must be positive, in arcsec / px, got {pixel_scale:g}")
+    try:
+        year = None if epoch is None else read_epoch(epoch)
+    except ValueError as problem:
+        raise InputError(f"--{problem}") from problem
+    return {"epoch": year, "pixel_scale": pixel_scale, "origin": origin}
+
+
+def state_first_pixel(frames):
+    """Say of which tables of sources nothing told where pixels begin.
+
+    Parameters
+    ----------
+    frames : list of Frame
+        Frames that were read.
+    """
+    untold = [f.source for f in frames if "nothing tells" in f.meta.get("first_pixel", "")]
+    if untold:
+        more = f" and {len(untold) - 1} more" if len(untold) > 1 else ""
+        log.warning(
+            "%s%s: nothing tells whether x and y count from 0 or from 1: the first pixel was taken "
+            "for 0 (--origin 1 if it is 1)",
+            untold[0],
+            more,
+        )
 
 
 def require_free(path, overwrite):

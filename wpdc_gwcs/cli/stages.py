@@ -1,5 +1,6 @@
 """Single stages from the shell: `detect` and `match`."""
 
+import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -7,13 +8,27 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.calibrate import Catalog, WcsFile
-from wpdc_gwcs.cli.options import MinSNR, Overwrite, Quiet, Threshold, Verbose, require_free
+from wpdc_gwcs.cli.options import (
+    Epoch,
+    MinSNR,
+    Origin,
+    Overwrite,
+    PixelScale,
+    Quiet,
+    Threshold,
+    Verbose,
+    by_hand,
+    require_free,
+    state_first_pixel,
+)
 from wpdc_gwcs.exceptions import InputError
+
+log = logging.getLogger("wpdc_gwcs.cli")
 
 Table = Annotated[Path, typer.Option("--output", metavar="FILE", help="Table to write (ECSV).")]
 
 
-def one_frame(path, *, wcs=None):
+def one_frame(path, *, wcs=None, **given):
     """Read the single frame of a file.
 
     Parameters
@@ -22,6 +37,8 @@ def one_frame(path, *, wcs=None):
         FITS image or source list; ``path[EXT]`` chooses an extension.
     wcs : str, optional
         Starting WCS of a source table.
+    **given
+        What else `wpdc_gwcs.io.read_frames` takes.
 
     Returns
     -------
@@ -30,7 +47,7 @@ def one_frame(path, *, wcs=None):
     """
     from wpdc_gwcs.io import read_frames
 
-    frames = read_frames(path, wcs=wcs)
+    frames = read_frames(path, wcs=wcs, **given)
     if len(frames) > 1:
         names = ", ".join(frame.source for frame in frames)
         raise InputError(f"{path}: has {len(frames)} frames, choose one with path[EXT]: {names}")
@@ -75,6 +92,9 @@ def match_command(
     catalog: Catalog,
     output: Table,
     wcs: WcsFile = None,
+    epoch: Epoch = None,
+    pixel_scale: PixelScale = None,
+    origin: Origin = None,
     blind: Annotated[
         bool,
         typer.Option(
@@ -94,7 +114,11 @@ def match_command(
     from wpdc_gwcs.matching import pair_table
 
     require_free(output, overwrite)
-    matched = match_frame(one_frame(frame, wcs=wcs), read_catalog(catalog), Settings(blind=blind))
+    one = one_frame(frame, wcs=wcs, **by_hand(epoch, pixel_scale, origin))
+    reference = read_catalog(catalog)
+    matched = match_frame(one, reference, Settings(blind=blind))
+    if one.epoch is None and "pmra" in reference.colnames:
+        log.warning("%s has no epoch: the stars' motions were not applied (--epoch)", one.source)
     i, j = matched.pairs
     x, y = (np.asarray(matched.sources[name], float)[i] for name in ("x", "y"))
     ra, dec = (np.asarray(matched.reference[name], float)[j] for name in ("ra", "dec"))
@@ -108,6 +132,7 @@ def match_command(
         reference=matched.start.pixels(ra, dec),
     )
     write_table(table, output, overwrite=overwrite)
+    state_first_pixel([one])
     if not quiet:
         found = matched.diagnostics
         typer.echo(

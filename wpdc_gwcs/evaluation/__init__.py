@@ -6,10 +6,10 @@ from wpdc_gwcs.evaluation.residuals import (
     binned_residuals,
     d80,
     evaluate,
-    robust_scatter,
     running_statistics,
 )
 from wpdc_gwcs.evaluation.weights import WeightResult, compare_weights, tabulate_weights
+from wpdc_gwcs.robust import robust_scatter
 
 __all__ = [
     "Drift",

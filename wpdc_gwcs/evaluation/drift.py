@@ -14,7 +14,7 @@ from astropy.table import QTable, Table
 from scipy.ndimage import median
 from scipy.stats import chi2
 
-from wpdc_gwcs.evaluation.residuals import robust_scatter
+from wpdc_gwcs.robust import robust_scatter
 
 __all__ = ["Drift", "detect_drift"]
 

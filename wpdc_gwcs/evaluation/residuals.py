@@ -6,12 +6,13 @@ import numpy as np
 from astropy.stats import SigmaClip
 from astropy.table import QTable
 
+from wpdc_gwcs.robust import robust_scatter
+
 __all__ = [
     "ResidualStatistics",
     "binned_residuals",
     "d80",
     "evaluate",
-    "robust_scatter",
     "running_statistics",
 ]
 
@@ -49,32 +50,6 @@ class ResidualStatistics:
     d80_dx: float
     d80_dy: float
     rms: float
-
-
-def robust_scatter(values):
-    """Scatter of values that outliers do not move: 1.4826 times the median absolute deviation.
-
-    Parameters
-    ----------
-    values : (N,) array_like
-        Values in any unit; NaN are ignored.
-
-    Returns
-    -------
-    float
-        Scatter in the unit of the values, the standard deviation if they are normal; NaN if empty.
-
-    Examples
-    --------
-    >>> from wpdc_gwcs.evaluation import robust_scatter
-    >>> round(robust_scatter([1.0, 2.0, 3.0, 1000.0]), 4)
-    1.4826
-    """
-    values = np.asarray(values, dtype=float)
-    values = values[np.isfinite(values)]
-    if values.size == 0:
-        return np.nan
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
 def d80(values):

@@ -15,8 +15,9 @@ import astropy.modeling  # noqa: F401
 
 from wpdc_gwcs.fitting.attitude import MIN_STARS_ATTITUDE, AttitudeFit, fit_attitude
 from wpdc_gwcs.fitting.fitter import WPDCFitter
-from wpdc_gwcs.fitting.linear import LinearSolution, robust_sigma, solve_linear
+from wpdc_gwcs.fitting.linear import LinearSolution, solve_linear
 from wpdc_gwcs.fitting.radial import RadialWeight
+from wpdc_gwcs.robust import robust_sigma
 
 __all__ = [
     "MIN_STARS_ATTITUDE",

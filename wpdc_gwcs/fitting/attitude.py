@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from wpdc_gwcs.exceptions import FitError
-from wpdc_gwcs.fitting.linear import robust_sigma, solve_linear
+from wpdc_gwcs.fitting.linear import solve_linear
+from wpdc_gwcs.robust import robust_sigma
 
 __all__ = ["MIN_STARS_ATTITUDE", "AttitudeFit", "fit_attitude"]
 

@@ -10,8 +10,9 @@ from astropy.modeling.fitting import (
 )
 
 from wpdc_gwcs.exceptions import FitError
-from wpdc_gwcs.fitting.linear import robust_sigma, solve_linear
+from wpdc_gwcs.fitting.linear import solve_linear
 from wpdc_gwcs.fitting.radial import RadialWeight
+from wpdc_gwcs.robust import robust_sigma
 
 __all__ = ["WPDCFitter"]
 

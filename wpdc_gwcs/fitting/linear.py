@@ -6,10 +6,9 @@ import numpy as np
 
 from wpdc_gwcs.exceptions import FitError
 
-__all__ = ["LinearSolution", "robust_sigma", "solve_linear"]
+__all__ = ["LinearSolution", "solve_linear"]
 
 # Turns a median absolute deviation into the standard deviation of a normal distribution.
-_MAD_TO_SIGMA = 1.482602218505602
 
 
 class LinearSolution(NamedTuple):
@@ -74,19 +73,3 @@ def solve_linear(design, target, weight=None, *, leverage=False):
     parameters = root @ (u.T @ (q.T @ target))
     hat = np.einsum("ij,ij->i", q, q) if leverage else None
     return LinearSolution(parameters, rank, float(s[0] / s[-1]), root, hat)
-
-
-def robust_sigma(values):
-    """Scatter about zero that outliers do not move: 1.4826 times the median absolute value.
-
-    Parameters
-    ----------
-    values : (N,) array_like
-        Residuals.
-
-    Returns
-    -------
-    float
-        Scatter in the unit of the values; NaN if there are none.
-    """
-    return _MAD_TO_SIGMA * float(np.median(np.abs(values))) if len(values) else np.nan

@@ -1,14 +1,82 @@
-"""Dates of FITS headers: the epoch in the middle of an exposure."""
+"""Dates of FITS headers: the epoch in the middle of an exposure, and when it began.
+
+Observatories have their own keywords.  What one of them says is told by the words that it is made
+of: a day (``MJD``, ``JD``, ``DATE``), what is observed (``OBS``, ``EXP``, ``SHUT``, ...) and a
+moment (``BEG``, ``START``, ``OPEN``; ``END``, ``CLOS``; ``AVG``, ``MID``), in any order and with or
+without hyphens.  A keyword with any other word in it (``DATE-MAP``, ``MJDREF``) is of something
+else.
+"""
 
 import re
 import warnings
-
-import numpy as np
+from dataclasses import dataclass
+from functools import lru_cache
 
 from wpdc_gwcs.exceptions import WPDCWarning
 from wpdc_gwcs.io.headers import header_text, header_value
+from wpdc_gwcs.io.timestamps import read_clock, read_timestamp
 
-__all__ = ["header_epoch", "header_start"]
+__all__ = ["header_epoch", "header_start", "julian_year", "read_epoch"]
+
+_MJD_RANGE = (-5000.0, 105000.0)  # 1845 to 2146
+# Without the word MJD, a number in a keyword like EXPSTART is a date if it is one of 1982 to 2064.
+_MODERN_MJD = (45000.0, 75000.0)
+_JD_FROM = 2.3e6
+_JD_MINUS_MJD = 2400000.5
+_YEARS = (1800.0, 2200.0)
+# Exposures are no longer than that, d.
+_LONGEST = 10.0
+# Seconds to add for TT.  UTC has the leap seconds of today: a few too many for old plates.
+_TO_TT = {
+    "UTC": 69.184,
+    "UT": 69.184,
+    "UT1": 69.184,
+    "GMT": 69.184,
+    "TAI": 32.184,
+    "IAT": 32.184,
+    "GPS": 51.184,
+    "TT": 0.0,
+    "TDT": 0.0,
+    "ET": 0.0,
+    "TDB": 0.0,
+    "TCB": 0.0,
+    "TCG": 0.0,
+}
+# Keywords of the standard (and those that everyone takes for it), best first, by moment.
+_STANDARD = {
+    "mid": ("MJDAVG", "DATEAVG"),
+    "begin": ("MJDBEG", "DATEBEG"),
+    "end": ("MJDEND", "DATEEND"),
+    "start": ("MJDOBS", "DATEOBS", "MJDBEG", "DATEBEG", "MJD", "JD"),
+}
+_DAY = "MJD|[HB]?JD|JUL(IAN)?|DATE?"
+_THING = "OB(S(ERV(ATION)?)?)?|EXP(OS(URE)?)?|SHUT(TER)?|SHTR|IMA?GE?|FRA?ME?|ACQ|INT|EPOCH"
+_SCALE = "UT1?|UTC|TAI|TT|TDB|TIM(E(STAMP)?)?|GPS"
+_MOMENTS = {
+    "begin": "START|STRT|STA?R?|BEG(IN)?|OPE?N",
+    "end": "END|STO?P|FIN(ISH)?|CLOSE?|CLS",
+    "mid": "AVG|MID(DLE|P(OIN)?T)?|MEAN|CENT?|EFF",
+}
+_WORD = re.compile(
+    f"(?:(?P<day>{_DAY})|(?P<thing>{_THING})|(?P<scale>{_SCALE})|(?P<begin>{_MOMENTS['begin']})"
+    f"|(?P<end>{_MOMENTS['end']})|(?P<mid>{_MOMENTS['mid']}))"
+)
+_KEYWORD = re.compile(f"(?:{_DAY}|{_THING}|{_SCALE}|{'|'.join(_MOMENTS.values())})+")
+# Clocks that go with a date without one.
+_CLOCK_KEYS = ("TIME-OBS", "UTC-OBS", "UT", "UTC", "UT-OBS", "UTSTART", "UT-STR", "UTC-BEG")
+_EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE", "XPOSURE", "ITIME", "TELAPSE", "EXP_TIME", "ELAPTIME")
+
+
+@dataclass(frozen=True)
+class _Date:
+    """What a keyword says: moment, modified Julian date and its time system."""
+
+    moment: str
+    key: str
+    rank: tuple
+    mjd: float
+    has_time: bool
+    system: str | None
 
 
 def header_epoch(headers, *, name="header"):
@@ -36,50 +104,43 @@ def header_epoch(headers, *, name="header"):
     In this order: ``MJD-AVG``, ``DATE-AVG``, the mean of ``MJD-BEG``/``DATE-BEG`` and
     ``MJD-END``/``DATE-END``, then ``MJD-OBS``, ``DATE-OBS`` (with ``TIME-OBS``, ``UTC-OBS``, ``UT``
     where it has no time), ``MJD-BEG``, ``DATE-BEG``, ``MJD``, ``JD``, each plus half of
-    ``EXPTIME``. ``TIMESYS`` is honoured to the second, which is 1e-3 mas for any star.
+    ``EXPTIME``; then other keywords that are made of the same words, such as ``OBSMJD``,
+    ``EXPSTART``, ``SHUTOPEN`` or ``DATE_OBS``.  ``TIMESYS`` is honoured to the second, which is
+    1e-3 mas for any star.
     """
     problems = []
     system = next((t for h in headers if (t := header_text(h, "TIMESYS"))), "UTC").upper()
     if system not in _TO_TT:
         problems.append(f"TIMESYS={system!r}")
-
-    def date(*keys):
-        for key in keys:
-            for header in headers:
-                if key in header:
-                    mjd = _mjd(header, key)
-                    if mjd is not None and _MJD_RANGE[0] < mjd < _MJD_RANGE[1]:
-                        return mjd
-                    problems.append(f"{key}={header_text(header, key)!r}")
-        return None
-
     exposure = 0.0
-    for key in ("EXPTIME", "EXPOSURE", "XPOSURE", "ITIME"):
+    for key in _EXPOSURE_KEYS:
         value = next((v for h in headers if (v := header_value(h, key)) is not None), None)
         if value is not None:
             if isinstance(value, int | float) and 0.0 <= value < 1e6:
                 exposure = float(value)
                 break
             problems.append(f"{key}={value!r}")
-    mid = date("MJD-AVG", "DATE-AVG")
-    if mid is None:
-        start, end = date("MJD-BEG", "DATE-BEG"), date("MJD-END", "DATE-END")
-        if start is not None and end is not None and 0.0 <= end - start < 10.0:
-            mid = 0.5 * (start + end)
-    if mid is None:
-        start = date("MJD-OBS", "DATE-OBS", "MJD-BEG", "DATE-BEG", "MJD", "JD")
-        if start is not None:
-            mid = start + 0.5 * exposure / 86400.0
+    found, broken = _dates(headers)
+    chosen, used = _middle(found, exposure)
+    standard = {k for keys in _STANDARD.values() for k in keys}
+    # What was passed over on the way; of other keywords only where nothing else tells.
+    problems += [
+        text
+        for rank, key, text in broken
+        if (rank < used and key in standard) or (chosen is None and rank[0] < 2)
+    ]
     if problems:
-        found = "no epoch" if mid is None else f"the epoch {2000 + (mid - 51544.5) / 365.25:.4f}"
+        year = None if chosen is None else 2000 + (chosen[0] - 51544.5) / 365.25
+        epoch = "no epoch" if year is None else f"the epoch {year:.4f}"
         warnings.warn(
             f"{name}: dates that make no sense are ignored: {', '.join(dict.fromkeys(problems))}; "
-            f"{found} is used",
+            f"{epoch} is used",
             WPDCWarning,
         )
-    if mid is None:
+    if chosen is None:
         return None
-    return 2000.0 + (mid + _TO_TT.get(system, _TO_TT["UTC"]) / 86400.0 - 51544.5) / 365.25
+    mjd, own = chosen
+    return julian_year(mjd, _TO_TT.get(own or system, _TO_TT["UTC"]))
 
 
 def header_start(headers):
@@ -96,87 +157,204 @@ def header_start(headers):
         Modified Julian date as the headers give it, in whatever time system; `None` if there is no
         date or nothing but the day, which many exposures share.
     """
-    for key in ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG"):
-        for header in headers:
-            mjd = _mjd(header, key, whole_days=False) if key in header else None
-            if mjd is not None and _MJD_RANGE[0] < mjd < _MJD_RANGE[1]:
-                return mjd
-    return None
+    found = [d for d in _dates(headers)[0] if d.has_time and d.moment in ("start", "begin")]
+    first = ("DATEOBS", "DATEBEG", "MJDOBS", "MJDBEG")
+    order = {key: k for k, key in enumerate(first)}
+    best = min(found, key=lambda d: (order.get(d.key, len(first)), d.rank), default=None)
+    return None if best is None else best.mjd
 
 
-_MJD_RANGE = (-5000.0, 105000.0)  # 1845 to 2146
-# Seconds to add for TT.  UTC has the leap seconds of today: a few too many for old plates.
-_TO_TT = {
-    "UTC": 69.184,
-    "UT": 69.184,
-    "UT1": 69.184,
-    "GMT": 69.184,
-    "TAI": 32.184,
-    "IAT": 32.184,
-    "GPS": 51.184,
-    "TT": 0.0,
-    "TDT": 0.0,
-    "ET": 0.0,
-    "TDB": 0.0,
-    "TCB": 0.0,
-    "TCG": 0.0,
-}
-_ISO_DATE = re.compile(r"([-+]?\d{4,5})-(\d\d)-(\d\d)(?:[T ](.+?))?Z?")
-_OLD_DATE = re.compile(r"(\d\d)/(\d\d)/(\d\d)")
-_CLOCK = re.compile(r"(\d{1,2}):(\d{1,2})(?::(\d{1,2}(?:\.\d*)?))?")
+def read_epoch(text):
+    """Read an epoch as it is given by hand.
 
+    Parameters
+    ----------
+    text : str or float
+        Julian year (2016.5, ``J2016.5``), date with or without time, or (modified) Julian date.
 
-def _mjd(header, key, *, whole_days=True):
-    """Give the modified Julian date of a keyword, `None` if it is not a date.
+    Returns
+    -------
+    float
+        Julian year.
 
-    Without ``whole_days`` a date needs a time of day.
+    Raises
+    ------
+    ValueError
+        If it is none of these.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.io.dates import read_epoch
+    >>> read_epoch("J2016.5"), round(read_epoch("2016-07-02"), 2)
+    (2016.5, 2016.5)
     """
-    value = header_value(header, key)
-    if not key.startswith("DATE"):
-        if isinstance(value, str):
-            try:
-                value = float(value)
-            except ValueError:
-                return None
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return None
-        # A zero stands for a date that was not filled in.
-        if value == 0 or not (whole_days or value % 1):
-            return None
-        return value - 2400000.5 if key == "JD" else float(value)
-    if not isinstance(value, str):
-        return None
-    clock = None
-    if found := _ISO_DATE.fullmatch(value.strip()):
-        year, month, day = (int(found[i]) for i in (1, 2, 3))
-        clock = found[4]
-    elif found := _OLD_DATE.fullmatch(value.strip()):
-        day, month, year = (int(found[i]) for i in (1, 2, 3))
-        year += 1900
-    else:
-        return None
-    if clock is None and key == "DATE-OBS":
-        clock = next(
-            (
-                t
-                for k in ("TIME-OBS", "UTC-OBS", "UT", "UTC")
-                if _CLOCK.fullmatch(t := header_text(header, k))
-            ),
-            None,
-        )
-    if clock is None and not whole_days:
-        return None
+    text = str(text).strip()
     try:
-        days = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}") - np.datetime64("1858-11-17")
+        number = float(text.lstrip("Jj"))
     except ValueError:
+        found = read_timestamp(text)
+        if found is not None and _MJD_RANGE[0] < found.mjd < _MJD_RANGE[1]:
+            return julian_year(found.mjd, _TO_TT.get(found.system, _TO_TT["UTC"]))
+    else:
+        if _YEARS[0] <= number <= _YEARS[1]:
+            return number
+        mjd = number - _JD_MINUS_MJD if number > _JD_FROM else number
+        if 1e4 < mjd < _MJD_RANGE[1]:
+            return julian_year(mjd, _TO_TT["UTC"])
+    raise ValueError(f"epoch must be a Julian year, a date or a Julian date, got {text!r}")
+
+
+def julian_year(mjd, seconds=0.0):
+    """Turn a modified Julian date into a Julian year.
+
+    Parameters
+    ----------
+    mjd : float
+        The date.
+    seconds : float, optional
+        To be added, to get to TT.
+
+    Returns
+    -------
+    float
+        Julian year.
+    """
+    return 2000.0 + (mjd + seconds / 86400.0 - 51544.5) / 365.25
+
+
+def _middle(found, exposure):
+    """Middle of the exposure with its time system, or None, and the rank of what tells it."""
+    best = {}
+    for date in found:
+        moment = "start" if date.moment == "begin" and date.key in _STANDARD["start"] else None
+        for m in {date.moment, moment} - {None}:
+            rank = _rank(m, date.key, date.rank[-1])
+            if m not in best or rank < best[m][0]:
+                best[m] = rank, date
+    if "mid" in best:
+        rank, date = best["mid"]
+        return (date.mjd, date.system), rank
+    if "begin" in best and "end" in best:
+        first, last = best["begin"][1], best["end"][1]
+        if 0.0 <= last.mjd - first.mjd < _LONGEST:
+            return (0.5 * (first.mjd + last.mjd), first.system), max(
+                best["begin"][0], best["end"][0]
+            )
+    for m in ("start", "begin"):
+        if m in best:
+            rank, date = best[m]
+            return (date.mjd + 0.5 * exposure / 86400.0, date.system), rank
+    if "end" in best:
+        rank, date = best["end"]
+        return (date.mjd - 0.5 * exposure / 86400.0, date.system), rank
+    return None, (9,)
+
+
+def _rank(moment, key, place):
+    """Order in which keywords are believed: the standard's, then others, by header and place."""
+    group = {"mid": 0, "begin": 1, "end": 1, "start": 1}[moment]
+    standard = _STANDARD[moment]
+    if key in standard:
+        return group, 0, standard.index(key), place
+    days = ("MJD", "DATE", "JD")
+    kind = next((k for k, word in enumerate(days) if word in key), len(days))
+    return group, 1, kind + (not _kinds(key) & {"day", *_MOMENTS}), place
+
+
+def _dates(headers):
+    """All dates of some headers, and the cards that look like dates and are none."""
+    found, broken, place = [], [], 0
+    for header in headers:
+        for keyword in header:
+            place += 1
+            key = _plain(keyword)
+            moment = _moment(key)
+            if moment is None:
+                continue
+            date = _date_of(header, keyword, key, moment, place)
+            if date is not None and _MJD_RANGE[0] < date.mjd < _MJD_RANGE[1]:
+                found.append(date)
+            elif "day" in _kinds(key):
+                text = f"{keyword}={header_text(header, keyword)!r}"
+                broken.append((_rank(moment, key, place), key, text))
+    return found, broken
+
+
+def _plain(keyword):
+    """Keyword without hyphens; of a hierarchical one, what stands behind the last names."""
+    words = re.sub(r"[-_.]", "", keyword.upper()).split()
+    for k in range(max(0, len(words) - 3), len(words)):
+        if _KEYWORD.fullmatch("".join(words[k:])):
+            return "".join(words[k:])
+    return words[-1] if words else ""
+
+
+@lru_cache(maxsize=4096)
+def _moment(key):
+    """Which moment a keyword is of: ``mid``, ``begin``, ``end``, ``start``; `None` if of none."""
+    if key in ("DATE", "EPOCH") or not _KEYWORD.fullmatch(key):
+        # DATE is that of the file, EPOCH was the equinox once.
         return None
-    mjd = float(days.astype(int))
-    if clock is not None:
-        found = _CLOCK.fullmatch(clock.strip())
-        if found is None:
+    kinds = _kinds(key)
+    return next((k for k in ("mid", "end", "begin") if k in kinds), "start")
+
+
+@lru_cache(maxsize=4096)
+def _kinds(key):
+    """Kinds of the words of a keyword."""
+    return frozenset(m.lastgroup for m in _WORD.finditer(key))
+
+
+def _date_of(header, keyword, key, moment, place):
+    """Read the date that a card gives, `None` if it gives none."""
+    value = header_value(header, keyword)
+    rank = _rank(moment, key, place)
+    if isinstance(value, str):
+        text = value.strip()
+        stamp = read_timestamp(text)
+        if stamp is not None:
+            mjd, has_time = stamp.mjd, stamp.has_time
+            clock = _clock_of(header) if moment in ("start", "begin") and not has_time else None
+            if clock is not None:
+                mjd, has_time = mjd + clock, True
+            return _Date(moment, key, rank, mjd, has_time, stamp.system)
+        try:
+            value = float(text.removeprefix("MJD").removeprefix("JD"))
+        except ValueError:
             return None
-        hours, minutes, seconds = int(found[1]), int(found[2]), float(found[3] or 0)
-        if hours > 24 or minutes > 59 or seconds >= 61.0:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    number = float(value)
+    # A zero stands for a date that was not filled in.
+    if number == 0:
+        return None
+    if number > _JD_FROM:
+        number -= _JD_MINUS_MJD
+    elif "EPOCH" in key:
+        return (
+            _Date(moment, key, rank, 51544.5 + (number - 2000.0) * 365.25, False, "TT")
+            if _YEARS[0] <= number <= _YEARS[1]
+            else None
+        )
+    elif "JD" not in key:
+        # seconds of a day, lengths and counters are no dates
+        kinds = _kinds(key)
+        is_moment = "thing" in kinds and kinds & set(_MOMENTS) and not kinds & {"scale", "day"}
+        if not is_moment or not _MODERN_MJD[0] < number < _MODERN_MJD[1]:
             return None
-        mjd += (hours + (minutes + seconds / 60.0) / 60.0) / 24.0
-    return mjd
+    return _Date(moment, key, rank, number, bool(float(value) % 1), _system_of(key))
+
+
+def _system_of(key):
+    """Time system that a keyword names (TAI-OBS, MJD-TDB), or None."""
+    found = re.search("TAI|TDB|GPS", key)
+    return None if found is None else found[0]
+
+
+def _clock_of(header):
+    """Time of day in a keyword of its own, as a fraction of a day."""
+    for key in _CLOCK_KEYS:
+        clock = read_clock(header_text(header, key)) if ":" in header_text(header, key) else None
+        if clock is not None:
+            return clock
+    return None

@@ -8,13 +8,11 @@ import os
 import re
 import uuid
 import warnings
-import zlib
 from pathlib import Path
 
 from astropy.io import fits
-from astropy.io.registry import IORegistryError
 
-from wpdc_gwcs.catalogs import split_extension
+from wpdc_gwcs.catalogs import READ_ERRORS, split_extension
 from wpdc_gwcs.exceptions import FileFormatError, InputError
 
 __all__ = [
@@ -29,21 +27,6 @@ __all__ = [
     "stem_of",
 ]
 
-# What astropy, asdf and the decompressors raise on damaged files.
-READ_ERRORS = (
-    OSError,
-    EOFError,
-    ValueError,
-    TypeError,
-    LookupError,
-    AttributeError,
-    RuntimeError,
-    ArithmeticError,
-    lzma.LZMAError,
-    zlib.error,
-    fits.VerifyError,
-    IORegistryError,
-)
 _BLOCK = 2880
 _OPENERS = {"gzip": gzip.open, "bzip2": bz2.open, "xz": lzma.open}
 _MAGIC = (

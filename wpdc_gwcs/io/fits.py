@@ -22,16 +22,18 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from wpdc_gwcs.exceptions import FileFormatError, WPDCWarning
-from wpdc_gwcs.io.files import READ_ERRORS, atomic_path, file_kind, first_line, open_fits, stem_of
-from wpdc_gwcs.io.headers import (
-    clean_header,
-    find_extension,
-    fold_attitude,
-    header_text,
-    parse_tan,
+from wpdc_gwcs.io.files import (
+    READ_ERRORS,
+    atomic_path,
+    file_kind,
+    first_line,
+    open_fits,
     split_extension,
+    stem_of,
 )
+from wpdc_gwcs.io.headers import clean_header, find_extension, header_text
 from wpdc_gwcs.io.sip import fit_sip, fit_sip_inverse
+from wpdc_gwcs.io.tan import fold_attitude, parse_tan
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project
 from wpdc_gwcs.solution import Calibration, DistortionSolution
 

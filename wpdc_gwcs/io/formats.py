@@ -7,8 +7,10 @@ from astropy.table import Table
 
 from wpdc_gwcs.camera import Camera
 from wpdc_gwcs.exceptions import FileFormatError
+from wpdc_gwcs.io.celestial import parse_wcs
 from wpdc_gwcs.io.files import check_output, file_kind, split_extension
-from wpdc_gwcs.io.headers import header_text, parse_tan, parse_wcs, read_headers
+from wpdc_gwcs.io.headers import header_text, read_headers
+from wpdc_gwcs.io.tan import parse_tan
 
 __all__ = ["FORMATS", "read", "read_wcs", "write"]
 

@@ -16,11 +16,10 @@ from dataclasses import replace
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import Table
 
-from wpdc_gwcs.catalogs import table_format
 from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
 from wpdc_gwcs.frame import Frame
+from wpdc_gwcs.io.celestial import parse_wcs
 from wpdc_gwcs.io.dates import header_epoch, header_start
 from wpdc_gwcs.io.exposures import camera_key, exposure_key, has_identifier
 from wpdc_gwcs.io.files import (
@@ -37,12 +36,18 @@ from wpdc_gwcs.io.headers import (
     find_extension,
     header_shape,
     header_text,
-    parse_wcs,
     positive_number,
     read_headers,
 )
+from wpdc_gwcs.io.sources import (
+    load_fits_sources,
+    position_columns,
+    read_source_table,
+    source_origin,
+    standardize_sources,
+)
 
-__all__ = ["read_frames", "standardize_sources"]
+__all__ = ["read_frames"]
 
 _DETECTOR_KEYS = (
     "DETECTOR",
@@ -79,6 +84,9 @@ def read_frames(
     image_shape=None,
     exposure_keyword=None,
     camera=True,
+    epoch=None,
+    pixel_scale=None,
+    origin=None,
 ):
     """Read the frames of a file.
 
@@ -102,6 +110,12 @@ def read_frames(
         for.
     camera : bool, optional
         Whether frames belong to a camera and an exposure; `False` leaves each on its own.
+    epoch : float, optional
+        Julian year of the middle of the exposures, instead of the headers' dates.
+    pixel_scale : float, optional
+        Scale in arcsec / px, instead of the headers'.
+    origin : {0, 1}, optional
+        Number of the first pixel in tables of sources, instead of what they tell.
 
     Returns
     -------
@@ -117,7 +131,7 @@ def read_frames(
     Warns
     -----
     WPDCWarning
-        If a date makes no sense, or a shape has to be guessed.
+        If a date makes no sense, a reference system is not known, or a shape has to be guessed.
 
     Notes
     -----
@@ -129,11 +143,26 @@ def read_frames(
     ``EXPNUM``, ``OBSID`` or the like is the same or, where there is none, the time at which they
     began; the frames of one file are so in any case, unless such an identifier differs.
     """
+    if origin not in (None, 0, 1):
+        raise ValueError(f"origin must be 0 or 1, got {origin!r}")
+    if pixel_scale is not None and not 0 < pixel_scale < np.inf:
+        raise ValueError(f"pixel_scale must be positive, in arcsec / px, got {pixel_scale!r}")
     path, extension = split_extension(path)
     stem = stem_of(path) if name is None else str(name)
+    by_hand = {} if epoch is None else {"epoch": float(epoch)}
     if file_kind(path, error=FrameError) != "fits":
-        frames = [_read_text_table(path, wcs, detector, stem, image_shape, exposure_keyword)]
-        return frames if camera else [_on_its_own(f) for f in frames]
+        frame = _read_text_table(
+            path,
+            wcs,
+            detector,
+            stem,
+            image_shape,
+            exposure_keyword,
+            pixel_scale=pixel_scale,
+            origin=origin,
+        )
+        frame = replace(frame, **by_hand)
+        return [frame if camera else _on_its_own(frame)]
     headers = None if wcs is None else _given_headers(wcs)
     with open_fits(path, error=FrameError) as hdus:
         chosen = _choose(hdus, path, extension)
@@ -154,14 +183,18 @@ def read_frames(
                 kind,
                 index,
                 None if headers is None else headers[i],
+                pixel_scale=pixel_scale,
+                origin=origin,
             )
             for i, (kind, index) in enumerate(chosen)
         ]
     frames = []
     for part in prepared:
+        for message in part["warnings"]:
+            warnings.warn(message)
         label = part["label"] if several else ""
         frames.append(_frame_of(part, path, stem, label, detector, image_shape, exposure_keyword))
-    frames = _distinct(frames, prepared)
+    frames = [replace(f, **by_hand) for f in _distinct(frames, prepared)]
     if not camera:
         return [_on_its_own(f) for f in frames]
     if not several or exposure_keyword is not None:
@@ -209,7 +242,7 @@ def _choose(hdus, path, extension, *, quiet=False):
         images = [i for i in images if "CTYPE1" in hdus[i].header] or images[:1]
     if images:
         return [("image", i) for i in images]
-    sources = [i for i in tables if _position_columns(hdus[i].columns.names) is not None]
+    sources = [i for i in tables if position_columns(hdus[i].columns.names) is not None]
     if sources:
         return [("table", sources[0])]
     if quiet:
@@ -229,7 +262,7 @@ def _image_shape(header):
     return axes[1], axes[0]
 
 
-def _prepare(hdus, where, kind, index, given):
+def _prepare(hdus, where, kind, index, given, *, pixel_scale, origin):
     """Everything that needs the open file: headers, WCS, names of columns."""
     hdu = hdus[index]
     header = hdu.header
@@ -242,7 +275,7 @@ def _prepare(hdus, where, kind, index, given):
         headers.append(given)
     if kind != "image":
         names = hdu.columns.names
-        if _position_columns(names) is None:
+        if position_columns(names) is None:
             raise FrameError(
                 f"{where}: source list must have positions (x, y; XWIN_IMAGE, YWIN_IMAGE; X_IMAGE, "
                 f"Y_IMAGE; ...), has {', '.join(names[:12])}"
@@ -264,6 +297,18 @@ def _prepare(hdus, where, kind, index, given):
     shape = _image_shape(header) if kind == "image" else header_shape(header)
     if shape is None:
         shape = header_shape(wcs_header)
+    # While a file is open, no warning is shown: ours are repeated when it is closed.
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        parsed = parse_wcs(
+            wcs_header,
+            hdus=hdus if given is None else None,
+            name=where,
+            error=FrameError,
+            pixel_scale=pixel_scale,
+        )
+    if kind == "table" and origin is None:
+        origin = source_origin(hdu.columns.names, headers[:2])
     return {
         "kind": kind,
         "index": index,
@@ -271,9 +316,9 @@ def _prepare(hdus, where, kind, index, given):
         "label": label,
         "headers": headers,
         "shape": shape,
-        "wcs": parse_wcs(
-            wcs_header, hdus=hdus if given is None else None, name=where, error=FrameError
-        ),
+        "wcs": parsed,
+        "origin": origin,
+        "warnings": [w.message for w in seen if issubclass(w.category, WPDCWarning)],
     }
 
 
@@ -298,7 +343,9 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
     if part["kind"] == "image":
         loaders["load_image"] = functools.partial(_load_image, str(path), index)
     else:
-        loaders["load_sources"] = functools.partial(_load_fits_sources, str(path), index)
+        loaders["load_sources"] = functools.partial(
+            load_fits_sources, str(path), index, origin=part["origin"]
+        )
     shape = image_shape if image_shape is not None and part["kind"] != "image" else part["shape"]
     if shape is None:
         shape = _guess_shape(loaders["load_sources"](), where)
@@ -312,7 +359,7 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
         gain=positive_number(headers, _GAIN_KEYS),
         saturation=positive_number(headers, _SATURATION_KEYS),
         **_keys_of(headers, exposure_keyword, where),
-        meta=_facts(headers),
+        meta=_facts(headers) | (_first_pixel(part["origin"]) if part["kind"] == "table" else {}),
         **loaders,
     )
 
@@ -351,6 +398,11 @@ def _detector_of(headers):
             if text.upper() not in (*_NOT_NAMES, "LDAC_OBJECTS", "LDAC_IMHEAD"):
                 return text
     return "detector"
+
+
+def _first_pixel(origin):
+    """State the number of the first pixel of a table of sources."""
+    return {"first_pixel": "0, since nothing tells" if origin is None else str(origin)}
 
 
 def _facts(headers):
@@ -412,23 +464,9 @@ def _load_image(path, index):
         return data.astype(np.float64 if data.dtype.itemsize == 8 else np.float32)
 
 
-def _load_fits_sources(path, index):
-    where = f"{path}[{index}]"
-    with open_fits(path, error=FrameError, lazy=True) as hdus:
-        try:
-            columns = hdus[index].columns
-            data = hdus[index].data
-            needed = {c: np.array(data[c]) for c in columns.names if c.lower() in _WANTED}
-            for column in columns:
-                if column.name in needed and column.null is not None:
-                    values = needed[column.name]
-                    needed[column.name] = np.where(values == int(column.null), np.nan, values)
-        except READ_ERRORS as problem:
-            raise FrameError(f"{where}: damaged source list: {first_line(problem)}") from problem
-    return standardize_sources(needed, name=where)
-
-
-def _read_text_table(path, wcs, detector, stem, image_shape, exposure_keyword):
+def _read_text_table(
+    path, wcs, detector, stem, image_shape, exposure_keyword, *, pixel_scale, origin
+):
     """Read a table of sources in any text format of astropy."""
     if wcs is None:
         raise FrameError(f"{path}: a table of sources needs a WCS header (--wcs)")
@@ -437,20 +475,10 @@ def _read_text_table(path, wcs, detector, stem, image_shape, exposure_keyword):
         raise FrameError(
             f"{wcs}: must have one WCS header, has {len(headers)}; choose with path[N]"
         )
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            table = Table.read(path, format=table_format(path))
-    except READ_ERRORS as problem:
-        raise FrameError(
-            f"{path}: neither FITS nor a readable table of sources: {first_line(problem)}"
-        ) from problem
-    if _position_columns(table.colnames) is None:
-        raise FrameError(
-            f"{path}: table of sources must have columns 'x' and 'y' (zero based; or X_IMAGE, "
-            f"Y_IMAGE), has {', '.join(table.colnames[:12])}"
-        )
-    sources = standardize_sources(table, name=str(path))
+    table, texts = read_source_table(path)
+    if origin is None:
+        origin = source_origin(table.colnames, texts=texts)
+    sources = standardize_sources(table, name=str(path), origin=origin)
     header = headers[0]
     shape = image_shape if image_shape is not None else header_shape(header)
     if shape is None:
@@ -466,12 +494,12 @@ def _read_text_table(path, wcs, detector, stem, image_shape, exposure_keyword):
         name=stem,
         detector=str(detector) if detector is not None else _detector_of([meta, header]),
         image_shape=tuple(int(n) for n in shape),
-        wcs=parse_wcs(header, name=str(wcs), error=FrameError),
+        wcs=parse_wcs(header, name=str(wcs), error=FrameError, pixel_scale=pixel_scale),
         epoch=epoch,
         source=str(path),
         load_sources=sources.copy,
         **_keys_of([meta, header], exposure_keyword, str(path)),
-        meta=_facts([meta, header]),
+        meta=_facts([meta, header]) | _first_pixel(origin),
     )
 
 
@@ -488,188 +516,3 @@ def _guess_shape(sources, where):
         WPDCWarning,
     )
     return shape
-
-
-# Families of position columns, best first: x, y, first pixel, errors.  SExtractor counts from one.
-_FAMILIES = (
-    ("x", "y", 0),
-    ("x_centroid", "y_centroid", 0),
-    ("xcentroid", "ycentroid", 0),
-    ("x_fit", "y_fit", 0),
-    ("xpsf_image", "ypsf_image", 1),
-    ("xwin_image", "ywin_image", 1),
-    ("xmodel_image", "ymodel_image", 1),
-    ("x_image", "y_image", 1),
-)
-_TAGS = {"xpsf_image": "psf", "xwin_image": "win", "xmodel_image": "model", "x_image": ""}
-_PLAIN_ERRORS = (("x_err", "y_err"), ("x_error", "y_error"), ("xerr", "yerr"))
-_FLUXES = (
-    "flux",
-    "flux_psf",
-    "flux_auto",
-    "flux_fit",
-    "flux_model",
-    "flux_best",
-    "flux_iso",
-    "flux_aper",
-)
-_MAGNITUDES = ("mag_psf", "mag_auto", "mag_best", "mag_iso", "mag_aper", "mag")
-_WANTED = {
-    *(c for family in _FAMILIES for c in family[:2]),
-    *(c for pair in _PLAIN_ERRORS for c in pair),
-    *(
-        f"{kind}{tag}_image"
-        for tag in ("psf", "win", "model", "")
-        for kind in ("erra", "errb", "errtheta", "errx2", "erry2")
-    ),
-    *_FLUXES,
-    *(f.replace("flux", "fluxerr") for f in _FLUXES),
-    *_MAGNITUDES,
-    *("snr_win", "snr", "roundness", "flags", "flags_win", "imaflags_iso", "elongation"),
-    *("sharpness", "fwhm", "fwhm_image", "flux_radius", "peak", "flux_max"),
-}
-
-
-def _position_columns(names):
-    """Best family of position columns that is there: x, y as spelled, first pixel; or `None`."""
-    spelled = {n.lower(): n for n in reversed(names)}
-    for x, y, origin in _FAMILIES:
-        if x in spelled and y in spelled:
-            # A PSF fit without errors did not converge on much (SExtractor leaves them out then).
-            if x == "xpsf_image" and "errapsf_image" not in spelled:
-                continue
-            return spelled[x], spelled[y], origin
-    if "xpsf_image" in spelled and "ypsf_image" in spelled:
-        return spelled["xpsf_image"], spelled["ypsf_image"], 1
-    return None
-
-
-def standardize_sources(table, *, name="sources"):
-    """Bring a source list to the columns of this package.
-
-    Parameters
-    ----------
-    table : mapping
-        Table or dictionary of columns, with this package's, photutils' or SExtractor's names.
-    name : str, optional
-        What messages call it.
-
-    Returns
-    -------
-    sources : `~astropy.table.Table`
-        ``x``, ``y`` (zero based) and, as far as they are there, ``x_err``, ``y_err``, ``flux``,
-        ``snr``, ``roundness``, ``flags``, ``sharpness``, ``fwhm``, ``peak``, ``mag``; the rows of
-        the input.
-
-    Raises
-    ------
-    FrameError
-        If there are no positions or a column is not numeric.
-
-    Notes
-    -----
-    Errors of SExtractor are ellipses (``ERRAWIN_IMAGE``, ...); taken is their extent along x and y.
-    ``ELONGATION`` e becomes a roundness 2 (e - 1) / (e + 1), which is DAOFIND's for a source
-    elongated along an axis.  Of SExtractor's ``FLAGS``, the lowest bit (a neighbour in the
-    aperture) says nothing of the centroid and is dropped.
-    """
-    names = list(getattr(table, "colnames", table))
-    found = _position_columns(names)
-    if found is None:
-        raise FrameError(f"{name}: source list must have positions, has {', '.join(names[:12])}")
-    x, y, origin = found
-    spelled = {n.lower(): n for n in reversed(names)}
-
-    def column(*aliases):
-        for alias in aliases:
-            if alias in spelled:
-                return _floats(table[spelled[alias]], spelled[alias], name)
-        return None
-
-    out = {"x": _floats(table[x], x, name) - origin, "y": _floats(table[y], y, name) - origin}
-    tag = _TAGS.get(x.lower())
-    errors = _ellipse(column, tag) if tag is not None else None
-    if errors is None:
-        errors = next(
-            ((column(a), column(b)) for a, b in _PLAIN_ERRORS if a in spelled and b in spelled),
-            None,
-        )
-    if errors is not None:
-        # An error of zero is SExtractor's word for none.
-        out["x_err"], out["y_err"] = (np.where(e > 0, e, np.nan) for e in errors)
-    fluxes = _FLUXES if tag == "psf" else tuple(f for f in _FLUXES if f != "flux_psf")
-    flux_name = next((f for f in fluxes if f in spelled), None)
-    if flux_name is not None:
-        out["flux"] = column(flux_name)
-    else:
-        magnitude = column(*_MAGNITUDES)
-        if magnitude is not None:
-            # 99 stands for no magnitude.
-            faint = np.where(np.abs(magnitude) < 90.0, magnitude, np.nan)
-            out["flux"] = 10.0 ** (-0.4 * (faint - 25.0))
-    out["snr"] = column("snr", "snr_win")
-    if out["snr"] is None and flux_name is not None:
-        error = column(flux_name.replace("flux", "fluxerr"))
-        if error is not None:
-            out["snr"] = out["flux"] / np.where(error > 0, error, np.nan)
-    out["roundness"] = column("roundness")
-    if out["roundness"] is None and (elongation := column("elongation")) is not None:
-        out["roundness"] = 2.0 * (elongation - 1.0) / (elongation + 1.0)
-    out["sharpness"] = column("sharpness")
-    out["fwhm"] = column("fwhm", "fwhm_image")
-    if out["fwhm"] is None and (radius := column("flux_radius")) is not None:
-        out["fwhm"] = 2.0 * radius
-    out["peak"] = column("peak", "flux_max")
-    flags = column("flags")
-    if flags is not None:
-        flags = np.nan_to_num(flags).astype(np.int64)
-        out["flags"] = flags if tag is None else _sextractor_flags(flags, column("imaflags_iso"))
-    return Table({c: v for c, v in out.items() if v is not None})
-
-
-def _sextractor_flags(flags, external):
-    """Translate FLAGS and IMAFLAGS_ISO of SExtractor."""
-    from wpdc_gwcs.detection import FLAG_BAD_PIXEL, FLAG_BLENDED, FLAG_EDGE, FLAG_SATURATED
-
-    ours = np.zeros_like(flags)
-    # 2 deblended, 4 saturated, 8 truncated, 16 aperture incomplete, above: memory overflows
-    for theirs, flag in (
-        (2, FLAG_BLENDED),
-        (4, FLAG_SATURATED),
-        (8 | 16, FLAG_EDGE),
-        (32 | 64 | 128, FLAG_BAD_PIXEL),
-    ):
-        ours[flags & theirs != 0] |= flag
-    if external is not None:
-        ours[np.nan_to_num(external) != 0] |= FLAG_BAD_PIXEL
-    return ours
-
-
-def _ellipse(column, tag):
-    """Errors along x and y from an error ellipse or from variances."""
-    a, b = column(f"erra{tag}_image"), column(f"errb{tag}_image")
-    if a is not None and b is not None:
-        theta = column(f"errtheta{tag}_image")
-        theta = np.zeros_like(a) if theta is None else np.radians(theta)
-        c2, s2 = np.cos(theta) ** 2, np.sin(theta) ** 2
-        return np.sqrt(a**2 * c2 + b**2 * s2), np.sqrt(a**2 * s2 + b**2 * c2)
-    x2, y2 = column(f"errx2{tag}_image"), column(f"erry2{tag}_image")
-    if x2 is not None and y2 is not None:
-        return np.sqrt(np.maximum(x2, 0.0)), np.sqrt(np.maximum(y2, 0.0))
-    return None
-
-
-def _floats(column, label, name):
-    """Plain float64 of one column; masked is NaN, of several apertures the first."""
-    mask = getattr(column, "mask", None)
-    column = getattr(column, "unmasked", column)
-    values = np.ma.getdata(getattr(column, "value", column))
-    try:
-        values = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise FrameError(
-            f"{name}: column {label!r} must be numeric, got {str(values.ravel()[0])!r}"
-        ) from None
-    if mask is not None:
-        values[np.broadcast_to(mask, values.shape)] = np.nan
-    return values if values.ndim == 1 else values.reshape(len(values), -1)[:, 0]

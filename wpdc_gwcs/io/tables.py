@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 
-from wpdc_gwcs.catalogs import table_format
+from wpdc_gwcs.catalogs import read_table_file
 from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.files import READ_ERRORS, atomic_path, file_kind, first_line
 
@@ -78,11 +78,13 @@ def read_table(path, *, columns=()):
     """
     path = Path(path)
     kind = file_kind(path)
-    form = "fits" if kind == "fits" else table_format(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            table = Table.read(path, format=form)
+            if kind == "fits":
+                table = Table.read(path, format="fits")
+            else:
+                table = read_table_file(path)
     except READ_ERRORS as problem:
         raise FileFormatError(f"{path}: not a readable table: {first_line(problem)}") from problem
     for column in columns:

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from wpdc_gwcs.detector import on_detector
+
 __all__ = ["N_FOLDS", "ResidualMap"]
 
 
@@ -107,7 +109,7 @@ class ResidualMap:
         x, y, dx, dy, x_err, y_err, fold = values
         variance = 0.5 * (x_err**2 + y_err**2)
         good = np.isfinite(x + y + dx + dy + variance) & (variance > 0)
-        good &= (x >= -0.5) & (x <= nx - 0.5) & (y >= -0.5) & (y <= ny - 0.5)
+        good &= on_detector(x, y, self.image_shape)
         x, y, dx, dy, x_err, y_err, fold, variance = (
             v[good] for v in (x, y, dx, dy, x_err, y_err, fold, variance)
         )

@@ -58,11 +58,13 @@ from wpdc_gwcs.matching._evidence import AreaEvidence
 from wpdc_gwcs.matching._high_level import match_sources, pair_table, select_sources
 from wpdc_gwcs.matching._mapping import SmoothMap
 from wpdc_gwcs.matching._nearby import match_nearby
+from wpdc_gwcs.matching._options import MatchOptions
 from wpdc_gwcs.matching._pairs import pair_nearest
 
 __all__ = [
     "AreaEvidence",
     "MatchDiagnostics",
+    "MatchOptions",
     "SmoothMap",
     "match_nearby",
     "match_planes",

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import gammaln, pdtr
+from scipy.special import gammaln, pdtr, pdtrc
 
+from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.matching._mapping import count_terms
 from wpdc_gwcs.matching._pairs import find_edges, one_to_one
 
@@ -21,10 +22,17 @@ __all__ = [
 # Sources looked at for the chance level, and shifts tried.
 _SAMPLE = 10_000
 _N_SHIFTS = 10
-# Pairs that a circle should hold, and those it must lead one to expect before it is judged.
+# Pairs that a circle should hold, and those it must lead one to expect at least to be judged.
 _PER_AREA = 16.0
 _JUDGED = 8.0
 _MOST_AREAS = 16
+# Chance that a right match is refused for the counts of any of its parts: of many parts some have
+# few pairs.  Parts are compared with this share of the pairs that the better ones promise, and are
+# good in any case with that share of them.
+_PARTS_CHANCE = 0.01
+_PROMISED, _PLENTY = 0.8, 0.4
+# Pairs by chance in a part at least: none seen does not mean that none could be.
+_LEAST_BY_CHANCE = 1e-3
 # Stars counted in circles: more would not sharpen the verdict.
 _COUNTED = 60_000
 # Share of the significance that is needed where all that the search could choose from is counted:
@@ -104,8 +112,9 @@ class Evidence:
             or self.search_significance >= _SEARCH_SHARE * min_significance
         )
 
-    def missing(self, *, min_significance, min_purity):
+    def missing(self, options):
         """Say what is missing for the match to be accepted; an empty string if nothing is."""
+        min_significance, min_purity = options.min_significance, options.min_purity
         if not self.is_significant(min_significance):
             searched = ""
             if np.isfinite(self.search_significance):
@@ -342,7 +351,7 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
     by_chance *= len(usable) / max(1, len(sample))
     hit_weight = len(usable) / max(1, len(sample)) / _N_SHIFTS
     back_x, back_y = mapping.inverse(*stars.points.T)
-    inside = (back_x > -0.5) & (back_x < nx - 0.5) & (back_y > -0.5) & (back_y < ny - 0.5)
+    inside = on_detector(back_x, back_y, image_shape)
     n_reference = int(np.count_nonzero(inside))
     n_sources = len(detector)
     # half a pair in all shifts together where none was seen
@@ -414,15 +423,17 @@ def _judge_areas(sources, reference, pairs, chance, weight, image_shape):
         for n in (n_sources, n_reference)
     ]
     expected = np.minimum(shares[0] * n_sources, shares[1] * n_reference)
-    judged = expected >= _JUDGED
-    # p < 1e-3 either way: more than chance, and not far fewer than expected beyond scatter
-    floor = max(0.5 * weight / step, 1e-3)
-    exceeds = [
-        poisson_significance(n, max(c, floor)) > 3.7
-        for n, c in zip(n_pairs, by_chance, strict=True)
-    ]
-    enough = (pdtr(n_pairs, 0.8 * expected) > 1e-3) | (n_pairs > 0.4 * expected)
-    accepted = ~judged | (np.array(exceeds) & enough)
+    # so many that none found would be too rare for one of so many parts
+    n_parts = np.count_nonzero(expected >= _JUDGED)
+    needed = max(_JUDGED, np.log(max(n_parts, 1) / _PARTS_CHANCE) / _PROMISED)
+    judged = expected >= needed
+    too_few = pdtr(n_pairs, _PROMISED * expected)
+    enough = (too_few > _PARTS_CHANCE / max(n_parts, 1)) | (n_pairs > _PLENTY * expected)
+    # chance must explain the pairs less well than a match does, which may have lost some
+    floor = max(0.5 * weight / step, _LEAST_BY_CHANCE)
+    too_many = pdtrc(n_pairs - 1.0, np.maximum(by_chance, floor))
+    too_many = np.where(n_pairs > 0, too_many, 1.0)
+    accepted = ~judged | (enough & (too_many < too_few))
     return [
         AreaEvidence(
             x=float(nodes[i, 0]),

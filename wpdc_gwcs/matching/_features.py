@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammainc
 
+from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.matching._pairs import find_nearest
 
 __all__ = [
@@ -59,7 +60,7 @@ def density_ratio_map(xs, ys, xr, yr, image_shape, *, per_cell=40.0):
         Edges of the cells, px.
     """
     ny, nx = image_shape
-    inside = (xr > -0.5) & (xr < nx - 0.5) & (yr > -0.5) & (yr < ny - 0.5)
+    inside = on_detector(xr, yr, image_shape)
     fewest = max(1, min(len(xs), np.count_nonzero(inside)))
     n_cells = int(np.clip(np.sqrt(fewest / per_cell), 1, 32))
     x_edges = np.linspace(-0.5, nx - 0.5, n_cells + 1)

@@ -4,11 +4,13 @@ import numpy as np
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
-from astropy.wcs import WCS
 from astropy.wcs.wcsapi import HighLevelWCSWrapper
 
+from wpdc_gwcs.columns import convert, read_numbers, unit_of
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._core import match_planes
+from wpdc_gwcs.models import local_plane, project
+from wpdc_gwcs.sky import move
 
 __all__ = ["match_sources", "pair_table", "select_sources"]
 
@@ -20,7 +22,6 @@ def match_sources(
     *,
     image_shape=None,
     epoch=None,
-    blind=False,
     max_roundness=0.3,
     min_snr=10.0,
     **options,
@@ -44,12 +45,10 @@ def match_sources(
     epoch : float or `~astropy.time.Time`, optional
         Epoch of the frame in Julian years, to which the catalogue is moved.  By default the
         catalogue is taken as it is.
-    blind : bool
-        Search also mirrored and turned frames, and a wider range of scale and pointing.
     max_roundness, min_snr : float
         Sources less round than this or of lower signal-to-noise take no part, nor do flagged ones.
     **options
-        Further options of `match_planes`.
+        Choices of `MatchOptions`: how far is searched, what evidence is needed.
 
     Returns
     -------
@@ -99,10 +98,10 @@ def match_sources(
         raise MatchError(
             f"none of {len(x)} sources has a finite position and is round, clean and bright enough"
         )
-    plane = _tangent_plane(wcs, image_shape)
+    pixels = _tangent_plane(wcs, image_shape)
     sky = wcs.pixel_to_world(x[rows], y[rows]).icrs
-    xs, ys = plane.wcs_world2pix(sky.ra.deg, sky.dec.deg, 0)
-    xr, yr = _project(plane, ra, dec)
+    xs, ys = pixels(sky.ra.deg, sky.dec.deg)
+    xr, yr = pixels(ra, dec)
 
     def part(name):
         return None if columns[name] is None else columns[name][rows]
@@ -117,7 +116,6 @@ def match_sources(
         mag=mag,
         x_err=part("x_err"),
         y_err=part("y_err"),
-        blind=blind,
         **options,
     )
     k = rows[i]
@@ -206,14 +204,14 @@ def _values(table, name, unit=None, *, required=None):
         if required:
             raise ValueError(f"{required} must have a column {name!r}; it has {table.colnames}")
         return None
-    column = table[name]
-    given = getattr(column, "unit", None)
-    values = np.ma.filled(np.ma.asarray(getattr(column, "value", column)).astype(float), np.nan)
-    if unit is None or given is None:
-        return values
     try:
-        return (values * u.Unit(given)).to_value(unit)
-    except u.UnitConversionError:
+        values = read_numbers(table[name])[0]
+    except ValueError as problem:
+        raise ValueError(f"column {name!r} {problem}") from None
+    given = unit_of(table[name], unit)
+    try:
+        return values if unit is None else convert(values, given, unit)
+    except ValueError:
         raise ValueError(f"column {name!r} must have a unit like {unit}; got {given}") from None
 
 
@@ -258,17 +256,13 @@ def _read_catalog(catalog, epoch):
         raise TypeError(f"catalog must be a Table or a SkyCoord; got {type(catalog).__name__}")
     if epoch is None or motion is None:
         return ra, dec, mag
-    return *_move(ra, dec, *motion, float(getattr(epoch, "jyear", epoch))), mag
-
-
-def _move(ra, dec, pmra, pmdec, ref_epoch, epoch):
-    """Straight motion on unit vectors; stars without a proper motion stay put."""
-    factor = (epoch - ref_epoch) * np.deg2rad(1 / 3.6e6)
-    east, north = np.nan_to_num(pmra * factor), np.nan_to_num(pmdec * factor)
-    a, d = np.deg2rad(ra), np.deg2rad(dec)
-    outward, upward = np.cos(d) - north * np.sin(d), np.sin(d) + north * np.cos(d)
-    moved_ra = np.rad2deg(a + np.arctan2(east, outward)) % 360
-    return moved_ra, np.rad2deg(np.arctan2(upward, np.hypot(outward, east)))
+    pmra, pmdec, ref_epoch = motion
+    years = float(getattr(epoch, "jyear", epoch)) - ref_epoch
+    # Stars without a proper motion stay put.
+    known = np.isfinite(pmra) & np.isfinite(pmdec) & np.isfinite(years)
+    ra, dec = np.array(ra), np.array(dec)
+    ra[known], dec[known] = move(ra[known], dec[known], pmra[known], pmdec[known], years[known])[:2]
+    return ra, dec, mag
 
 
 def _find_shape(wcs, x, y):
@@ -283,38 +277,25 @@ def _find_shape(wcs, x, y):
 
 
 def _tangent_plane(wcs, image_shape):
-    """Linear WCS that touches the starting WCS in the centre of the frame."""
+    """Give the linear map of the plane that touches the WCS in the centre of the frame.
+
+    Returns a function from RA and Dec to pixels.
+    """
     ny, nx = image_shape
     center = np.array([0.5 * (nx - 1), 0.5 * (ny - 1)])
-    step = 0.5
-    sky = wcs.pixel_to_world(
-        center[0] + step * np.array([0, 1, -1, 0, 0]), center[1] + step * np.array([0, 0, 0, 1, -1])
-    ).icrs
-    ra, dec = sky.ra.deg, sky.dec.deg
-    if not (np.isfinite(ra) & np.isfinite(dec)).all():
+
+    def sky(x, y):
+        icrs = wcs.pixel_to_world(x, y).icrs
+        return icrs.ra.deg, icrs.dec.deg
+
+    crval, cd = local_plane(sky, *center, step=0.5)
+    if not np.isfinite(crval).all():
         raise ValueError("wcs gives no sky position for the centre of the frame")
-    plane = WCS(naxis=2)
-    plane.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    plane.wcs.cunit = ["deg", "deg"]
-    plane.wcs.crval = [ra[0], dec[0]]
-    plane.wcs.crpix = [1, 1]
-    plane.wcs.cd = np.eye(2)
-    xi, eta = plane.wcs_world2pix(ra, dec, 0)
-    cd = np.array([[xi[1] - xi[2], xi[3] - xi[4]], [eta[1] - eta[2], eta[3] - eta[4]]]) / (2 * step)
     if not np.isfinite(cd).all() or abs(np.linalg.det(cd)) == 0:
         raise ValueError("wcs is degenerate in the centre of the frame")
-    plane.wcs.crpix = center + 1
-    plane.wcs.cd = cd
-    return plane
 
+    def pixels(ra, dec):
+        plane = np.array(project(ra, np.where(np.abs(dec) <= 90, dec, np.nan), crval))
+        return np.linalg.solve(cd, plane) + center[:, None]
 
-def _project(plane, ra, dec):
-    """Pixels of the tangent plane; NaN for what is not a position or on the far half of the sky."""
-    crval = np.deg2rad(plane.wcs.crval)
-    a, d = np.deg2rad(ra), np.deg2rad(dec)
-    height = np.sin(crval[1]) * np.sin(d) + np.cos(crval[1]) * np.cos(d) * np.cos(a - crval[0])
-    x, y = np.full(len(ra), np.nan), np.full(len(ra), np.nan)
-    near = np.isfinite(height) & (height > 0.01) & (np.abs(dec) <= 90)
-    if near.any():
-        x[near], y[near] = plane.wcs_world2pix(ra[near], dec[near], 0)
-    return x, y
+    return pixels

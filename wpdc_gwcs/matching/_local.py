@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from wpdc_gwcs.matching._mapping import scatter_of
 from wpdc_gwcs.matching._pairs import find_nearest
+from wpdc_gwcs.robust import plane_scatter
 
 __all__ = ["LocalCorrection"]
 
@@ -38,10 +38,10 @@ class LocalCorrection:
         """
         if len(points) < 4 * N_NEIGHBOURS:
             return None
-        before = scatter_of(*residual.T)
+        before = plane_scatter(*residual.T)
         correction = cls(points, residual)
         left_out = residual - correction(points, leave_out=True)[0]
-        return correction if scatter_of(*left_out.T) < _WORTHWHILE * before else None
+        return correction if plane_scatter(*left_out.T) < _WORTHWHILE * before else None
 
     def __call__(self, positions, *, leave_out=False):
         """Evaluate the correction.

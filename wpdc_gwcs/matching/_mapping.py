@@ -11,7 +11,6 @@ __all__ = [
     "count_terms",
     "find_narrow_axis",
     "fit_smooth_map",
-    "scatter_of",
     "turn_and_scale",
 ]
 
@@ -72,16 +71,6 @@ def turn_and_scale(matrix, image_shape):
     cosine = of_x * matrix[0, 0] + of_y * matrix[1, 1]
     sine = of_x * matrix[1, 0] - of_y * matrix[0, 1]
     return float(np.rad2deg(np.arctan2(sine, cosine))), float(np.hypot(sine, cosine))
-
-
-def scatter_of(dx, dy):
-    """Robust 1-sigma scatter per axis from the median length of two-dimensional residuals.
-
-    For Gaussian noise the squared length has its median at ``2 ln 2`` variances.
-    """
-    if len(dx) == 0:
-        return np.nan
-    return float(np.sqrt(np.median(dx**2 + dy**2) / (2 * np.log(2))))
 
 
 def _design(u, v, order):

@@ -9,8 +9,9 @@ from scipy.special import gammaln
 
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
-from wpdc_gwcs.matching._mapping import SmoothMap, scatter_of
+from wpdc_gwcs.matching._mapping import SmoothMap
 from wpdc_gwcs.matching._pairs import find_edges, one_to_one
+from wpdc_gwcs.robust import plane_scatter
 
 __all__ = ["match_nearby"]
 
@@ -237,7 +238,7 @@ def _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend
         linear = _fit(at[i], reference[j] - sources[i], scale)
         left = reference[j] - sources[i] - at[i] @ linear
         free = _terms(len(i))
-        scatter = scatter_of(*left.T) * np.sqrt(len(i) / max(1.0, len(i) - free / 2))
+        scatter = plane_scatter(*left.T) * np.sqrt(len(i) / max(1.0, len(i) - free / 2))
         key = i.tobytes(), j.tobytes()
         if key == before:
             break

@@ -14,7 +14,7 @@ from wpdc_gwcs.models.distortion import (
 )
 from wpdc_gwcs.models.lookup_table import LookupTable
 from wpdc_gwcs.models.polynomial import PVInverse, PVPolynomial
-from wpdc_gwcs.models.tangent import SkyTangent, TangentSky, deproject, project
+from wpdc_gwcs.models.tangent import SkyTangent, TangentSky, deproject, local_plane, project
 from wpdc_gwcs.models.terms import PVTerms, pv_terms
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "SkyToDetector",
     "TangentSky",
     "deproject",
+    "local_plane",
     "project",
     "pv_terms",
 ]

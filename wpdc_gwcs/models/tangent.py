@@ -6,7 +6,7 @@ from astropy.modeling import Model, Parameter
 from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.models.mapping import PlaneMap
 
-__all__ = ["SkyTangent", "TangentSky", "deproject", "project"]
+__all__ = ["SkyTangent", "TangentSky", "deproject", "local_plane", "project"]
 
 
 class _Tangent:
@@ -402,3 +402,33 @@ class SkyTangent(_Linear):
     def inverse(self):
         """The model from undistorted pixels to the sky (a `TangentSky`)."""
         return TangentSky(self.crpix.value, self.cd.value, self.crval.value)
+
+
+def local_plane(sky, x, y, *, step=1.0):
+    """Give the linear map and the tangent point of a WCS at a pixel.
+
+    Parameters
+    ----------
+    sky : callable
+        Pixels ``x, y`` to RA and Dec in degrees.
+    x, y : float
+        The pixel.
+    step : float, optional
+        Pixels over which the derivatives are taken.
+
+    Returns
+    -------
+    crval : (2,) ndarray
+        RA and Dec of the pixel, deg.
+    cd : (2, 2) ndarray
+        Derivatives of the standard coordinates about it with respect to x and y, deg / px.
+    """
+    at = (
+        x + step * np.array([0.0, 1.0, -1.0, 0.0, 0.0]),
+        y + step * np.array([0.0, 0, 0, 1.0, -1.0]),
+    )
+    ra, dec = sky(*at)
+    crval = np.array([ra[0], dec[0]])
+    xi, eta = project(ra, dec, crval)
+    cd = np.array([[xi[1] - xi[2], xi[3] - xi[4]], [eta[1] - eta[2], eta[3] - eta[4]]])
+    return crval, cd / (2 * step)

@@ -10,6 +10,7 @@ from astropy.table import QTable, Table
 from astropy.time import Time
 from astropy.wcs import WCS
 
+from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.simulation._camera import SIGMA_PER_FWHM, Camera, find_zero_point
 from wpdc_gwcs.simulation.distortion import Distortion
 from wpdc_gwcs.simulation.exposure import SimulatedExposure
@@ -385,7 +386,7 @@ def _stars_on_detector(sky, epoch, optics, wcs):
 def _measure(rng, stars, camera, *, spurious, lost, noise, floor, slope):
     ny, nx = camera.image_shape
     x, y, magnitude = stars["x"].data, stars["y"].data, stars["magnitude"].data
-    seen = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
+    seen = on_detector(x, y, (ny, nx))
     seen &= rng.uniform(size=len(stars)) >= lost
     seen &= camera.peak(camera.flux(magnitude)) < camera.saturation
     x, y, magnitude = x[seen], y[seen], magnitude[seen]

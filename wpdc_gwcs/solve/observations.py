@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.exceptions import FitError
 
 __all__ = ["Detector", "Observations", "gather"]
@@ -61,8 +62,7 @@ class Detector:
         y : (N,) ndarray
             Pixels along y.
         """
-        ny, nx = self.image_shape
-        return (x >= -0.5) & (x <= nx - 0.5) & (y >= -0.5) & (y <= ny - 0.5)
+        return on_detector(x, y, self.image_shape)
 
     def grid(self, n):
         """Pixels of an ``n`` by ``n`` grid from one outer edge to the other, flat ``(x, y)``.

@@ -1,0 +1,55 @@
+"""Reference catalogues: read, check, move to the epoch of a frame, cut to the sky it covers.
+
+::
+
+    file or table --read_catalog--> checked table --fill_motions--> all stars with a motion
+                                                  --select_cone--> near the frame
+                                                  --propagate--> at the epoch of the frame
+
+Motions are filled from the whole catalogue, before the cut, so that a star moves alike in all
+frames.
+
+The checked table has plain float64 columns with fixed names and units, whatever the input called
+them:
+
+===================== ======== =================================================================
+column                unit     meaning
+===================== ======== =================================================================
+``ra``, ``dec``       deg      ICRS position at ``ref_epoch``
+``pmra``, ``pmdec``   mas / yr proper motion (``pmra`` includes cos Dec), NaN where unknown
+``parallax``          mas      NaN where unknown
+``ref_epoch``         yr       Julian year of the position
+``phot_g_mean_mag``   mag      a brightness, for ordering only
+``bp_rp``             mag      a color, NaN where unknown
+``ra_error``, ...     mas      errors of ``ra`` (times cos Dec), ``dec``, ``pmra``, ``pmdec``,
+                               ``parallax``; NaN where unknown
+``ra_pmra_corr``      --       correlation of the errors of ``ra`` and ``pmra``; likewise
+                               ``dec_pmdec_corr``
+``ra_dec_corr``       --       correlation of the errors of ``ra`` and ``dec``
+``catalog_index``     --       row of the input, zero based
+``pm_from_neighbors`` --       true where `fill_motions` filled the motion
+===================== ======== =================================================================
+"""
+
+from wpdc_gwcs.catalogs.cone import select_cone
+from wpdc_gwcs.catalogs.files import (
+    READ_ERRORS,
+    is_fits,
+    read_lines,
+    read_table_file,
+    split_extension,
+)
+from wpdc_gwcs.catalogs.motions import fill_motions, propagate
+from wpdc_gwcs.catalogs.standard import read_catalog
+
+__all__ = [
+    "READ_ERRORS",
+    "fill_motions",
+    "is_fits",
+    "propagate",
+    "read_catalog",
+    "read_lines",
+    "read_table_file",
+    "select_cone",
+    "split_extension",
+]

@@ -1,0 +1,213 @@
+"""Tables in files, whatever their format: what astropy reads, and what it stumbles over."""
+
+import bz2
+import gzip
+import lzma
+import re
+import struct
+import zlib
+from pathlib import Path
+from xml.parsers.expat import ExpatError
+
+from astropy.io import fits
+from astropy.io.ascii import InconsistentTableError
+from astropy.io.registry import IORegistryError
+from astropy.table import Table
+from yaml import YAMLError
+
+__all__ = ["READ_ERRORS", "is_fits", "read_lines", "read_table_file", "split_extension"]
+
+# What astropy, asdf, the decompressors and the parsers raise on damaged or foreign files.
+READ_ERRORS = (
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    RuntimeError,
+    ArithmeticError,
+    AssertionError,
+    ImportError,
+    MemoryError,
+    ExpatError,
+    IORegistryError,
+    YAMLError,
+    fits.VerifyError,
+    lzma.LZMAError,
+    struct.error,
+    zlib.error,
+)
+# Endings of tables that are no plain text: astropy finds out by itself.
+_FOREIGN = re.compile(r"\.(vot|votable|parquet|pq|xml|h5|hdf5|html?|asdf|mrt|feather)$")
+_OPENERS = ((b"\x1f\x8b", gzip.open), (b"BZh", bz2.open), (b"\xfd7zXZ\x00", lzma.open))
+# Characters that no text has.
+_BINARY = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
+_MARKS = (
+    (b"\xef\xbb\xbf", "utf-8-sig"),
+    (b"\xff\xfe\x00\x00", "utf-32"),
+    (b"\xff\xfe", "utf-16"),
+    (b"\xfe\xff", "utf-16"),
+)
+# What stands for no value whatever the column holds; other words may be names of something.
+_FILL = [(t, "0") for t in ("", "null", "NULL", "Null", "--", "---", "N/A", "n/a", "\\N")]
+
+
+def split_extension(path):
+    """Split ``path[EXT]``; a file whose name really ends in brackets is left alone.
+
+    Parameters
+    ----------
+    path : path-like
+        What the user gave.
+
+    Returns
+    -------
+    path : `~pathlib.Path`
+        The file.
+    extension : int, str or None
+        Number or name of the extension.
+    """
+    text = str(path)
+    found = re.fullmatch(r"(.+)\[([^\[\]]+)\]", text)
+    if found is None or Path(text).exists():
+        return Path(text), None
+    extension = found[2].strip()
+    return Path(found[1]), int(extension) if re.fullmatch("[0-9]{1,9}", extension) else extension
+
+
+def is_fits(path):
+    """Tell whether a file is FITS, compressed as a whole or not.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    bool
+        By its first bytes.
+    """
+    with _open(path) as file:
+        return file.read(9) == b"SIMPLE  ="
+
+
+def read_table_file(path, format=None):
+    """Read a table that is not FITS.
+
+    Parameters
+    ----------
+    path : path-like
+        Text in any form that astropy knows (also compressed, with a byte-order mark, in latin-1),
+        VOTable, HDF5, Parquet, HTML, ASDF.
+    format : str, optional
+        Format name for `astropy.table.Table.read`; found by name and content without it.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        The table; values that stand for none (``null``, ``--``) are masked.
+
+    Raises
+    ------
+    one of READ_ERRORS
+        If the file cannot be read.
+    """
+    # Absolute, since a leading '~' is not a name to astropy.
+    path = Path(path).absolute()
+    text_format = format is not None and format.startswith("ascii")
+    if format is not None and not text_format:
+        return Table.read(path, format=format)
+    if not text_format and _FOREIGN.search(_plain_name(path)):
+        return Table.read(path, format="votable" if ".vot" in path.name.lower() else None)
+    lines = read_lines(path)
+    if not any(line.strip() for line in lines):
+        raise ValueError("it has no text")
+    if format is None and re.match(r"\s*(<\?xml|<VOTABLE)", "\n".join(lines[:2]), re.IGNORECASE):
+        return Table.read(path, format="votable")
+    if text_format:
+        return Table.read(lines, format=format, fill_values=_FILL)
+    if lines[0].startswith("# %ECSV"):
+        return _read_ecsv(lines)
+    if _plain_name(path).endswith((".csv", ".tsv")):
+        return _read_csv(lines)
+    try:
+        return Table.read(lines, format="ascii", fill_values=_FILL)
+    except InconsistentTableError as problem:
+        # astropy lists all that it has tried, in fifty lines
+        raise ValueError("it has no form of a table that is known") from problem
+
+
+def read_lines(path):
+    """Read the lines of a text file.
+
+    Parameters
+    ----------
+    path : path-like
+        Compressed or not, in UTF-8, with a byte-order mark, or in latin-1.
+
+    Returns
+    -------
+    list of str
+        Lines without their ends.
+
+    Raises
+    ------
+    one of READ_ERRORS
+        If the file cannot be read or is no text.
+    """
+    with _open(path) as file:
+        return _decode(file.read()).splitlines()
+
+
+def _open(path):
+    with open(path, "rb") as file:
+        start = file.read(6)
+    return next((opener for mark, opener in _OPENERS if start.startswith(mark)), open)(path, "rb")
+
+
+def _plain_name(path):
+    return re.sub(r"\.(gz|bz2|xz)$", "", path.name.lower())
+
+
+def _decode(content):
+    encoding = next((e for mark, e in _MARKS if content.startswith(mark)), "utf-8")
+    if encoding.startswith("utf-8") and _BINARY.search(content):
+        raise ValueError("it is neither text nor a table of a known kind")
+    try:
+        return content.decode(encoding)
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def _read_csv(lines):
+    """Read CSV with any delimiter, comments before it, and names that may stand in a comment."""
+    comments = next((k for k, line in enumerate(lines) if not line.startswith("#")), 0)
+    head, rows = lines[:comments], [line for line in lines[comments:] if line.strip()]
+    delimiter = max(",;\t|", key=rows[0].count)
+    if head and head[-1].count(delimiter) == rows[0].count(delimiter) > 0:
+        names = head[-1].lstrip("# ").split(delimiter)
+        # a comment has the names if the first row has numbers
+        if any(re.match(r"[-+]?\d", cell.strip()) for cell in rows[0].split(delimiter)) and all(
+            re.match(r"[A-Za-z_]", cell.strip(' "')) for cell in names
+        ):
+            rows = [head[-1].lstrip("# "), *rows]
+    return Table.read(rows, format="ascii.csv", delimiter=delimiter, fill_values=_FILL)
+
+
+def _read_ecsv(lines):
+    """Read ECSV; where a cell is not what the header says, as text with the header's units."""
+    try:
+        return Table.read(lines, format="ascii.ecsv", fill_values=_FILL)
+    except ValueError:
+        head = [line for line in lines if line.startswith("#")]
+        rows = [line for line in lines if not line.startswith("#")]
+        found = re.search(r"delimiter: *['\"]?([^'\"\s])", "\n".join(head))
+        delimiter = found[1] if found else " "
+        declared = Table.read([*head, rows[0]], format="ascii.ecsv")
+        table = Table.read(rows, format="ascii.basic", delimiter=delimiter, fill_values=_FILL)
+        for name in set(declared.colnames) & set(table.colnames):
+            table[name].unit = getattr(declared[name], "unit", None)
+        table.meta.update(declared.meta)
+        return table

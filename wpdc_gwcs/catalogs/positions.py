@@ -1,0 +1,254 @@
+"""Positions of a catalogue: columns, units, impossible rows, old reference systems."""
+
+import logging
+import re
+import warnings
+
+import numpy as np
+from astropy import units as u
+from astropy.coordinates import Angle, SkyCoord
+
+from wpdc_gwcs.columns import convert, read_numbers, read_text, unit_of
+from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
+
+__all__ = ["find_positions", "read_positions", "turn_to_icrs"]
+
+log = logging.getLogger(__name__)
+
+# Pairs of position columns, best first; compared without regard to case.
+_POSITIONS = (
+    ("ra", "dec"),
+    ("ra_icrs", "de_icrs"),
+    ("ra_icrs", "dec_icrs"),
+    ("alphapsf_j2000", "deltapsf_j2000"),
+    ("alphawin_j2000", "deltawin_j2000"),
+    ("alpha_j2000", "delta_j2000"),
+    ("xpsf_world", "ypsf_world"),
+    ("xwin_world", "ywin_world"),
+    ("x_world", "y_world"),
+    ("raj2000", "dej2000"),
+    ("raj2000", "decj2000"),
+    ("_raj2000", "_dej2000"),
+    ("ra_j2000", "dec_j2000"),
+    ("ra_deg", "dec_deg"),
+    ("radeg", "dedeg"),
+    ("radeg", "decdeg"),
+    ("ramean", "decmean"),
+    ("coord_ra", "coord_dec"),
+    ("right_ascension", "declination"),
+    ("alpha", "delta"),
+)
+# Columns that are radians where they have no unit: the tables of the Rubin pipelines.
+_RADIANS = ("coord_ra",)
+# Stars per square degree that no catalogue has: taken for degrees, these positions are in another
+# unit.  The lower one decides where the name of the column speaks for radians already.
+_TOO_DENSE, _DENSE = 1e7, 1e5
+# Rows without which a density says nothing.
+_CROWD = 50
+# Share of rows with impossible positions from which on it is the column that is wrong.
+_MOST_WRONG = 0.5
+# Single precision keeps so many bits of a position: of 360 deg, 0.05 arcsec.
+_SINGLE = np.finfo(np.float32).eps
+# Reference systems that differ from ICRS by more than 0.02 arcsec, by what metadata call them.
+_OLD_SYSTEMS = {"FK4": "fk4", "B1950": "fk4", "FK4-NO-E": "fk4noeterms"}
+_SEXAGESIMAL = re.compile(r"[-+]?\d{1,3}[: hd]\s*[0-5]?\d[: m'](\s*[0-5]?\d(\.\d*)?[s\"]?)?")
+
+
+def find_positions(spelled):
+    """Find the columns of positions.
+
+    Parameters
+    ----------
+    spelled : dict
+        Names of the columns, see `wpdc_gwcs.columns.spelled_names`.
+
+    Returns
+    -------
+    (str, str) or None
+        Names of right ascension and declination; `None` if there are none.
+    """
+    for ra, dec in _POSITIONS:
+        if ra in spelled and dec in spelled:
+            return spelled[ra], spelled[dec]
+    return None
+
+
+def read_positions(table, pair, name):
+    """Read positions, and tell which rows have one.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The input.
+    pair : (str, str)
+        Columns of right ascension and declination.
+    name : str
+        What messages call the input.
+
+    Returns
+    -------
+    columns : dict
+        ``ra`` and ``dec``, deg.
+    keep : (N,) ndarray of bool
+        Rows with a position.
+    rounding : float
+        Error by single precision, mas; 0 for double.
+
+    Raises
+    ------
+    CatalogError
+        If there is no position, or most are impossible.
+
+    Warns
+    -----
+    WPDCWarning
+        If rows that cannot be are left out, positions are taken for radians or are in single
+        precision.
+    """
+    found = [_angle(table[column], column, name) for column in pair]
+    values, unreadable = zip(*found, strict=True)
+    factor = _radians_to_degrees(table, pair, values, name)
+    ra, dec = (v * factor for v in values)
+    finite = np.isfinite(ra) & np.isfinite(dec)
+    if not finite.any():
+        raise CatalogError(
+            f"{name}: catalogue must have rows with finite {pair[0]!r} and {pair[1]!r}, "
+            f"none of {len(table)} has"
+        )
+    keep = finite.copy()
+    dropped = []
+    for column, angle, low, high in ((pair[0], ra, -360.0, 360.0), (pair[1], dec, -90.0, 90.0)):
+        wrong = keep & ((angle < low) | (angle > high))
+        if not wrong.any():
+            continue
+        row = int(np.flatnonzero(wrong)[0])
+        rule = f"column {column!r} must lie in [{low:g}, {high:g}] deg, got {angle[row]:g}"
+        if wrong.sum() > _MOST_WRONG * finite.sum():
+            raise CatalogError(f"{name}: {rule} in row {row}")
+        dropped.append(f"{wrong.sum()} out of range ({rule} in row {row})")
+        keep &= ~wrong
+    broken = unreadable[0] | unreadable[1]
+    if broken.any():
+        row = int(np.flatnonzero(broken)[0])
+        cells = ", ".join(repr(str(table[column][row])) for column in pair)
+        dropped.append(f"{broken.sum()} that cannot be read ({cells} in row {row})")
+    missing = int(np.sum(~finite & ~broken))
+    if missing:
+        log.info("%s: %d of %d rows have no position", name, missing, len(table))
+    if dropped:
+        warnings.warn(
+            f"{name}: {np.sum(~keep) - missing} of {len(table)} rows are left out: "
+            + "; ".join(dropped),
+            WPDCWarning,
+        )
+    if not keep.any():
+        raise CatalogError(f"{name}: none of {len(table)} rows has a position that can be used")
+    rounding = 0.0
+    if any(getattr(table[column], "dtype", None) == np.float32 for column in pair):
+        # half a step of the last bit at most, a uniform distribution
+        step = _SINGLE * 2.0 ** np.floor(np.log2(max(np.nanmax(np.abs(ra[keep])), 1e-3)))
+        rounding = float(step * 3.6e6 / np.sqrt(12))
+        warnings.warn(
+            f"{name}: positions are in single precision, which rounds them by up to "
+            f"{step * 1.8e6:.2g} mas: a catalogue in double precision gives a better solution",
+            WPDCWarning,
+        )
+    return {"ra": ra % 360.0, "dec": dec}, keep, rounding
+
+
+def _angle(column, label, name):
+    """Degrees, or what the column has without a unit; and where there is no number."""
+    unit = unit_of(column)
+    try:
+        values, unreadable = read_numbers(column)
+    except ValueError as problem:
+        values = _sexagesimal(column, unit, label)
+        if values is None:
+            raise CatalogError(f"{name}: column {label!r} {problem}") from None
+        return values, np.isnan(values)
+    if unit is None:
+        return values, unreadable
+    try:
+        return convert(values, unit, u.deg), unreadable
+    except ValueError:
+        given = str(getattr(column, "unit", unit))
+        raise CatalogError(
+            f"{name}: unit of column {label!r} must be an angle, got {given!r}"
+        ) from None
+
+
+def _sexagesimal(column, unit, label):
+    """Degrees from ``10:00:00.5`` or ``10 00 00.5``: hours in right ascension; or `None`."""
+    text = read_text(column)
+    good = np.array([bool(_SEXAGESIMAL.fullmatch(t)) for t in text.tolist()], bool)
+    if not good.any():
+        return None
+    hours = not label.lower().lstrip("_").startswith(("d", "b")) and unit != u.deg
+    values = np.full(len(text), np.nan)
+    values[good] = Angle(text[good].tolist(), unit=u.hourangle if hours else u.deg).deg
+    return values
+
+
+def _radians_to_degrees(table, pair, values, name):
+    """Degrees per unit of positions without a unit, which may be radians."""
+    if any(unit_of(table[column]) is not None for column in pair):
+        return 1.0
+    ra, dec = values
+    known = np.isfinite(ra) & np.isfinite(dec)
+    ra, dec = ra[known], dec[known]
+    named = pair[0].lower() in _RADIANS
+    in_range = np.all(np.abs(ra) <= 2 * np.pi) and np.all(np.abs(dec) <= np.pi / 2)
+    if not in_range or len(ra) < (1 if named else _CROWD):
+        return 1.0
+    side = max(np.ptp(ra) * np.cos(np.radians(np.median(dec))), np.ptp(dec), 1e-9)
+    density = len(ra) / side**2
+    if density > (_DENSE if named else _TOO_DENSE):
+        warnings.warn(
+            f"{name}: columns {pair[0]!r} and {pair[1]!r} have no unit and are taken for radians: "
+            f"as degrees, they would have {density:.2g} stars per square degree",
+            WPDCWarning,
+        )
+        return 180.0 / np.pi
+    if named:
+        raise CatalogError(
+            f"{name}: columns {pair[0]!r} and {pair[1]!r} must have a unit: without, they may be "
+            f"degrees or radians ({ra[0]:g}, {dec[0]:g} in the first row)"
+        )
+    return 1.0
+
+
+def turn_to_icrs(columns, keep, meta, name):
+    """Turn positions of an old system, where the metadata name one, to ICRS.
+
+    Parameters
+    ----------
+    columns : dict
+        ``ra`` and ``dec``, deg, which are replaced.
+    keep : (N,) ndarray of bool
+        Rows with a position.
+    meta : dict
+        Metadata of the table.
+    name : str
+        What messages call the input.
+
+    Raises
+    ------
+    CatalogError
+        If there are proper motions, which would be of the old system too.
+    """
+    words = [str(meta.get(k, "")) for k in ("RADESYS", "RADECSYS", "radesys", "COOSYS", "system")]
+    system = next((_OLD_SYSTEMS[w.strip().upper()] for w in words if _is_old(w)), None)
+    if system is None:
+        return
+    if {"pmra", "pmdec"} & set(columns):
+        raise CatalogError(
+            f"{name}: catalogue must be in ICRS or FK5 to have proper motions, is in "
+            f"{system.upper()}"
+        )
+    sky = SkyCoord(columns["ra"][keep], columns["dec"][keep], unit="deg", frame=system).icrs
+    columns["ra"][keep], columns["dec"][keep] = sky.ra.deg, sky.dec.deg
+    log.info("%s: positions are turned from %s to ICRS", name, system.upper())
+
+
+def _is_old(word):
+    return word.strip().upper() in _OLD_SYSTEMS

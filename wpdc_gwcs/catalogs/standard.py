@@ -1,0 +1,335 @@
+"""Reading of a reference catalogue: from any table to the checked one."""
+
+import logging
+import re
+import warnings
+
+import numpy as np
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.table import Table
+
+from wpdc_gwcs.catalogs.epochs import reference_epochs
+from wpdc_gwcs.catalogs.files import READ_ERRORS, is_fits, read_table_file, split_extension
+from wpdc_gwcs.catalogs.positions import find_positions, read_positions, turn_to_icrs
+from wpdc_gwcs.catalogs.stars import one_of_each, read_identifiers
+from wpdc_gwcs.catalogs.units import UNITS, unit_column
+from wpdc_gwcs.columns import (
+    convert,
+    find_name,
+    listed,
+    read_numbers,
+    spelled_names,
+    unit_of,
+)
+from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
+
+__all__ = ["read_catalog"]
+
+log = logging.getLogger(__name__)
+
+
+# Output column -> aliases best first; without a unit it is that of the output.
+_OPTIONAL = {
+    "pmra": ("pmra", "pm_ra_cosdec", "pmra_cosdec", "pmracosdec", "pm_ra", "pmalpha_j2000"),
+    "pmdec": ("pmdec", "pm_dec", "pmde", "pmdelta_j2000"),
+    "parallax": ("parallax", "plx"),
+    "ra_error": ("ra_error", "e_ra_icrs", "e_raj2000", "e_ra"),
+    "dec_error": ("dec_error", "e_de_icrs", "e_dej2000", "e_dec", "e_de"),
+    "pmra_error": ("pmra_error", "e_pmra"),
+    "pmdec_error": ("pmdec_error", "e_pmdec", "e_pmde"),
+    "parallax_error": ("parallax_error", "e_plx", "e_parallax"),
+    "ra_dec_corr": ("ra_dec_corr", "radecor"),
+    "ra_pmra_corr": ("ra_pmra_corr", "rapmracor"),
+    "dec_pmdec_corr": ("dec_pmdec_corr", "depmdecor"),
+}
+_MAGNITUDES = (
+    "phot_g_mean_mag",
+    "gmag",
+    "mag",
+    "mag_auto",
+    "mag_psf",
+    "rmag",
+    "imag",
+    "vmag",
+    "jmag",
+    "kmag",
+)
+_COLORS = ("bp_rp", "bp-rp", "bprp")
+# Where there is no color, it is the difference of these.
+_BLUE = ("phot_bp_mean_mag", "bpmag", "bp_mag")
+_RED = ("phot_rp_mean_mag", "rpmag", "rp_mag")
+# Numbers that stand for none: no measurement is exactly one of them, least of all twice.
+_SENTINELS = np.array([s * n for n in (999.0, 9999.0, 99999.0, 1e20, 1e30) for s in (1, -1)])
+# Magnitudes beyond stand for none (99, -99).
+_MOST_MAG = 90.0
+_MARK = "wpdc_catalog"
+
+
+def read_catalog(source, *, format=None):
+    """Read a reference catalogue and bring it to one form.
+
+    Parameters
+    ----------
+    source : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
+        A file in any format that astropy reads as a table (FITS, ECSV, CSV, VOTable, ...), a
+        FITS_LDAC catalogue, ``path[EXT]`` for one table of a FITS file, or what is already in
+        memory.  Columns may have Gaia, VizieR or SExtractor names in any case.
+    format : str, optional
+        Format name for `astropy.table.Table.read` where the file name does not tell.
+
+    Returns
+    -------
+    catalog : `~astropy.table.Table`
+        Plain float64 columns as listed in `wpdc_gwcs.catalogs`.  Rows without a usable position
+        and further rows of a star are left out; ``catalog_index`` tells the row of the input.
+
+    Raises
+    ------
+    CatalogError
+        If the file cannot be read, has no rows or no position columns, if a unit or most values
+        of a position are impossible.
+
+    Warns
+    -----
+    WPDCWarning
+        If there are proper motions and nothing says at which epoch the positions are, if rows or
+        columns that cannot be read are left out, rows are copies of others, or positions are in
+        single precision.
+
+    Notes
+    -----
+    A column without a unit is taken to be in the unit of the Gaia archive (deg, mas, mas / yr, yr);
+    ``ERRA_WORLD`` and its kin in deg.  The epoch is that of the column ``ref_epoch``, else of the
+    table's metadata, else of the Gaia release that the metadata names.
+
+    Rows are one star, of which the row with the most complete and most precise values is kept,
+    where their ``source_id`` is the same and they are within 2 arcsec, or as `group_copies` tells
+    from positions, errors and magnitudes.
+
+    Examples
+    --------
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs import read_catalog
+    >>> catalog = read_catalog(Table({"RA": [10.0, float("nan"), 10.1], "DEC": [-5.0, -5.0, -5.1]}))
+    >>> print(catalog["ra", "dec", "catalog_index"])
+     ra  dec  catalog_index
+    deg  deg
+    ---- ---- -------------
+    10.0 -5.0             0
+    10.1 -5.1             2
+    """
+    if isinstance(source, SkyCoord):
+        name, table = "catalog", _table_of_coordinates(source)
+    elif isinstance(source, Table):
+        name, table = source.meta.get(_MARK, "catalog"), source
+    elif isinstance(source, str) or hasattr(source, "__fspath__"):
+        name, table = str(source), _read_table(source, format)
+        table.meta.pop(_MARK, None)
+    else:
+        raise TypeError(
+            f"catalog must be a path, a Table or a SkyCoord, got {type(source).__name__}"
+        )
+    return _standardize(table, name)
+
+
+def _read_table(path, format):
+    """Read a table from a file; a `CatalogError` whatever goes wrong."""
+    path, extension = split_extension(path)
+    try:
+        if not path.exists():
+            raise CatalogError(f"{path}: catalogue must be an existing file, found nothing there")
+        if path.is_file() and path.stat().st_size == 0:
+            raise CatalogError(f"{path}: catalogue must not be empty, the file has 0 bytes")
+        # The readers warn of odd units and headers; what matters of that is checked afterwards.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if format in (None, "fits") and is_fits(path):
+                return _read_fits_table(path, extension)
+            if extension is not None:
+                raise CatalogError(f"{path}[{extension}]: only FITS files have extensions")
+            if format is None and re.search(r"\.(fits?|fts|fz)(\.gz)?$", path.name.lower()):
+                raise CatalogError(
+                    f"{path}: a FITS file must begin with 'SIMPLE  =', this one does not"
+                )
+            return read_table_file(path, format)
+    except READ_ERRORS as error:
+        first_line = (str(error).strip() or type(error).__name__).split("\n")[0]
+        raise CatalogError(
+            f"{path}: cannot be read as a table: {type(error).__name__}: {first_line}"
+        ) from error
+
+
+def _read_fits_table(path, extension):
+    with fits.open(path, memmap=False) as hdus:
+        if extension is not None:
+            tables = [hdus[extension]]
+            if not isinstance(tables[0], fits.BinTableHDU | fits.TableHDU):
+                raise CatalogError(f"{path}[{extension}]: must be a table extension")
+        else:
+            tables = [h for h in hdus if isinstance(h, fits.BinTableHDU | fits.TableHDU)]
+            if not tables:
+                raise CatalogError(f"{path}: must have a table extension, has none")
+            # LDAC files have a header table first, others whatever their writer liked.
+            tables.sort(key=lambda h: find_positions(spelled_names(h.columns.names)) is None)
+        return Table.read(tables[0], format="fits", mask_invalid=False)
+
+
+def _table_of_coordinates(coordinates):
+    icrs = coordinates.icrs.reshape(-1) if coordinates.isscalar else coordinates.icrs.ravel()
+    table = Table({"ra": icrs.ra.deg, "dec": icrs.dec.deg})
+    if "s" in coordinates.data.differentials:
+        table["pmra"] = icrs.pm_ra_cosdec.to_value(u.mas / u.yr)
+        table["pmdec"] = icrs.pm_dec.to_value(u.mas / u.yr)
+        if coordinates.obstime is not None:
+            table["ref_epoch"] = np.broadcast_to(coordinates.obstime.jyear, len(table))
+    return table
+
+
+def _standardize(table, name):
+    """Build the checked table; `name` is what messages call the input."""
+    if len(table) == 0:
+        raise CatalogError(f"{name}: catalogue must have rows, has 0")
+    spelled = spelled_names(table.colnames)
+    pair = find_positions(spelled)
+    if pair is None:
+        table, pair = _positions_of_coordinates(table, name)
+        spelled = spelled_names(table.colnames)
+    columns, keep, rounding = read_positions(table, pair, name)
+    for column, aliases in _OPTIONAL.items():
+        found = find_name(spelled, aliases)
+        if found is not None:
+            values = _optional(table, found, UNITS.get(column), name)
+            if values is not None:
+                columns[column] = values
+    _add_ellipse_errors(columns, table, spelled, name)
+    for column in ("ra_error", "dec_error"):
+        if column in columns and rounding:
+            columns[column] = np.hypot(columns[column], rounding)
+    magnitude = _magnitudes(table, spelled, _MAGNITUDES, name)
+    if magnitude is not None:
+        columns["phot_g_mean_mag"] = magnitude
+    color = _colors(table, spelled, name)
+    if color is not None:
+        columns["bp_rp"] = color
+    epoch = reference_epochs(
+        table, spelled, pair[0], name, has_motion={"pmra", "pmdec"} <= set(columns)
+    )
+    if epoch is not None:
+        columns["ref_epoch"] = epoch
+    turn_to_icrs(columns, keep, table.meta, name)
+    identifiers = read_identifiers(table, spelled)
+    keep[keep] = one_of_each(columns, keep, identifiers, name)
+    result = Table({c: unit_column(c, np.ascontiguousarray(v[keep])) for c, v in columns.items()})
+    if identifiers is not None:
+        result["source_id"] = identifiers[keep]
+    index = np.arange(len(table))
+    if isinstance(table.meta.get(_MARK), str) and "catalog_index" in table.colnames:
+        # What read_catalog returned, possibly cut since: its rows keep pointing to the first input.
+        index = np.asarray(table["catalog_index"])
+    result["catalog_index"] = index[keep]
+    if "pm_from_neighbors" in spelled and table[spelled["pm_from_neighbors"]].dtype.kind == "b":
+        # Else a second reading would take what has been filled for measured.
+        result["pm_from_neighbors"] = np.asarray(table[spelled["pm_from_neighbors"]])[keep]
+    result.meta[_MARK] = name
+    return result
+
+
+def _positions_of_coordinates(table, name):
+    """Take the positions from a column of coordinates, where there is one."""
+    found = next((c for c in table.colnames if isinstance(table[c], SkyCoord)), None)
+    if found is None:
+        raise CatalogError(
+            f"{name}: catalogue must have columns 'ra' and 'dec' (or RA_ICRS/DE_ICRS, "
+            "X_WORLD/Y_WORLD, ALPHA_J2000/DELTA_J2000, RAJ2000/DEJ2000, ra_deg/dec_deg), "
+            f"has {listed(table.colnames)}"
+        )
+    read = _table_of_coordinates(table[found])
+    for column in table.colnames:
+        if column != found and column not in read.colnames:
+            read[column] = table[column]
+    read.meta.update(table.meta)
+    return read, ("ra", "dec")
+
+
+def _optional(table, column, unit, name):
+    """Values of a column that may be missing; `None`, and a warning, where it cannot be read."""
+    unit = u.dimensionless_unscaled if unit is None else unit
+    given = unit_of(table[column], unit)
+    try:
+        values, unreadable = read_numbers(table[column])
+        values[np.isin(values, _SENTINELS)] = np.nan
+        values = convert(values, given, unit)
+    except ValueError as problem:
+        rule = str(problem)
+        if "convertible" in rule:
+            wanted = "none" if unit == u.dimensionless_unscaled else f"convertible to {unit}"
+            rule = f"must have the unit {wanted}, has {str(table[column].unit)!r}"
+        warnings.warn(f"{name}: column {column!r} {rule}: it is left out", WPDCWarning)
+        return None
+    if unreadable.any():
+        row = int(np.flatnonzero(unreadable)[0])
+        log.info(
+            "%s: %d values of column %r cannot be read, such as %r",
+            name,
+            unreadable.sum(),
+            column,
+            str(table[column][row]),
+        )
+    return values
+
+
+def _magnitudes(table, spelled, aliases, name):
+    """Magnitudes of the first of some columns that can be read, or `None`."""
+    for alias in aliases:
+        if alias in spelled:
+            # the order counts: the unit does not
+            column = table[spelled[alias]]
+            plain = Table({spelled[alias]: getattr(column, "value", column)}, copy=False)
+            plain[spelled[alias]].unit = None
+            values = _optional(plain, spelled[alias], None, name)
+            if values is not None:
+                values[np.abs(values) >= _MOST_MAG] = np.nan
+                return values
+    return None
+
+
+def _add_ellipse_errors(columns, table, spelled, name):
+    """Errors of SExtractor and SCAMP: an ellipse, its angle counted from the RA axis."""
+    if "ra_error" in columns:
+        return
+    for tag in ("psf", "win", ""):
+        a, b, theta = f"erra{tag}_world", f"errb{tag}_world", f"errtheta{tag}_world"
+        if a not in spelled or b not in spelled:
+            continue
+        # SExtractor's world coordinates are in degrees, also where the file does not say so.
+        major, minor = (_angle_or_none(table, spelled[c], u.mas, name) for c in (a, b))
+        angle = np.zeros(len(table))
+        if theta in spelled:
+            angle = _angle_or_none(table, spelled[theta], u.rad, name)
+        if major is None or minor is None or angle is None:
+            continue
+        c2, s2 = np.cos(angle) ** 2, np.sin(angle) ** 2
+        columns["ra_error"] = np.sqrt(major**2 * c2 + minor**2 * s2)
+        columns["dec_error"] = np.sqrt(major**2 * s2 + minor**2 * c2)
+        return
+
+
+def _angle_or_none(table, column, unit, name):
+    degrees = _optional(table, column, u.deg, name) if unit_of(table[column]) is not None else None
+    if degrees is None:
+        plain = _optional(table, column, None, name)
+        degrees = plain
+    return None if degrees is None else degrees * u.deg.to(unit)
+
+
+def _colors(table, spelled, name):
+    """Find the color of every star, or `None` where the table has neither it nor both bands."""
+    found = find_name(spelled, _COLORS)
+    color = None if found is None else _magnitudes(table, spelled, (found.lower(),), name)
+    bands = [_magnitudes(table, spelled, aliases, name) for aliases in (_BLUE, _RED)]
+    if any(band is None for band in bands):
+        return color
+    blue, red = bands
+    return blue - red if color is None else np.where(np.isnan(color), blue - red, color)

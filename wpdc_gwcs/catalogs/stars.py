@@ -1,0 +1,125 @@
+"""The stars of a catalogue: one row for each."""
+
+import warnings
+
+import numpy as np
+
+from wpdc_gwcs.copies import group_copies
+from wpdc_gwcs.exceptions import WPDCWarning
+from wpdc_gwcs.sky import directions, move
+
+__all__ = ["one_of_each", "read_identifiers"]
+
+# Copies of one star are no further apart than that, arcsec; rows of one identifier twice as much.
+_COPY_REACH = 1.0
+_MAS = np.pi / 180.0 / 3.6e6
+
+
+def one_of_each(columns, keep, identifiers, name):
+    """Mark one row for each star among those that are kept.
+
+    Parameters
+    ----------
+    columns : dict
+        Checked columns.
+    keep : (N,) ndarray of bool
+        Rows that are kept so far.
+    identifiers : (N,) ndarray or None
+        Names of the stars.
+    name : str
+        What messages call the input.
+
+    Returns
+    -------
+    (n,) ndarray of bool
+        Mask over the rows that are kept: the one with most and most precise values of each star.
+
+    Warns
+    -----
+    WPDCWarning
+        If there are further rows of a star.
+    """
+    part = {c: v[keep] for c, v in columns.items()}
+    n = len(part["ra"])
+    ra, dec = _at_one_epoch(part)
+    points = np.stack(directions(ra, dec)[0], axis=1)
+    links = None
+    if identifiers is not None:
+        links = _same_identifier(identifiers[keep], points)
+    errors = None
+    if "ra_error" in part and "dec_error" in part:
+        errors = np.hypot(part["ra_error"], part["dec_error"]) / np.sqrt(2) * _MAS
+    star = group_copies(
+        points,
+        reach=_COPY_REACH * 1e3 * _MAS,
+        errors=errors,
+        mag=part.get("phot_g_mean_mag"),
+        links=links,
+    )
+    known = np.zeros(n)
+    for column in ("pmra", "pmdec", "phot_g_mean_mag", "parallax"):
+        if column in part:
+            known += np.isfinite(part[column])
+    rank = np.nan_to_num(errors, nan=np.inf) if errors is not None else np.zeros(n)
+    order = np.lexsort((np.arange(n), rank, -known, star))
+    first = np.concatenate([[True], star[order][1:] != star[order][:-1]])
+    best = np.zeros(n, bool)
+    best[order[first]] = True
+    if not best.all():
+        again = np.flatnonzero(~best)
+        warnings.warn(
+            f"{name}: {len(again)} of {n} rows are further rows of a star that is there already "
+            f"(RA {part['ra'][again[0]]:.6f} Dec {part['dec'][again[0]]:.6f} deg for one): one row "
+            "of each star is kept",
+            WPDCWarning,
+        )
+    return best
+
+
+def _at_one_epoch(part):
+    """Positions at one epoch, where rows differ in theirs and have motions."""
+    ra, dec = part["ra"], part["dec"]
+    if not {"pmra", "pmdec", "ref_epoch"} <= set(part) or np.ptp(part["ref_epoch"]) == 0:
+        return ra, dec
+    years = np.nanmedian(part["ref_epoch"]) - part["ref_epoch"]
+    known = np.isfinite(years * part["pmra"] * part["pmdec"])
+    ra, dec = ra.copy(), dec.copy()
+    ra[known], dec[known] = move(
+        ra[known], dec[known], part["pmra"][known], part["pmdec"][known], years[known]
+    )[:2]
+    return ra, dec
+
+
+def _same_identifier(identifiers, points):
+    """Pairs of rows of one identifier; none where identifiers do not tell stars apart."""
+    order = np.argsort(identifiers, kind="stable")
+    i, j = order[:-1], order[1:]
+    same = (identifiers[i] == identifiers[j]) & (identifiers[i] > 0)
+    i, j = i[same], j[same]
+    near = np.linalg.norm(points[i] - points[j], axis=1) <= 2 * _COPY_REACH * 1e3 * _MAS
+    return (i[near], j[near]) if 2 * near.sum() > len(near) else (i[:0], j[:0])
+
+
+def read_identifiers(table, spelled):
+    """Read whole numbers that name the stars.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The input.
+    spelled : dict
+        Names of its columns.
+
+    Returns
+    -------
+    (N,) ndarray or None
+        0 where there is none; `None` without such a column.
+    """
+    if "source_id" not in spelled:
+        return None
+    column = table[spelled["source_id"]]
+    values = np.ma.getdata(column)
+    if np.asarray(values).dtype.kind not in "iu":
+        return None
+    mask = getattr(column, "mask", None)
+    return np.asarray(values) if mask is None else np.where(mask, 0, np.asarray(values))

@@ -1,0 +1,108 @@
+"""Rows of a list that are one and the same star: lists stacked, cones that overlap.
+
+A star that stands twice in a list has two candidates in the other one, and is lost to a match.
+"""
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+__all__ = ["group_copies"]
+
+# Two positions of one star differ by less than this many of their errors in 0.99999 of all cases.
+_N_SIGMA = 5.0
+# Largest distance of two copies, in units of the distance between stars: chance puts another star
+# as close as that to 3 of 100.
+_REACH = 0.07
+# Copies beyond the errors are believed in where there are so many that chance and double stars
+# cannot be it: 1 to 2 of 100 stars are double within an arcsecond, few with two of one brightness.
+_LEAST_COPIES, _LEAST_SHARE, _LEAST_SHARE_ALIKE = 10, 0.05, 0.02
+# Copies are no further apart than so many times the median of their distances.
+_SPREAD = 4.0
+# Differences of brightness, magnitudes: of one star in two bands, and of one star measured again.
+_MOST_APART, _ALIKE = 1.0, 0.1
+# Rows that are looked at next to each row, and the neighbor that tells how far stars are apart.
+_NEAR, _DISTANT = 6, 6
+# By chance, as many pairs are between a radius and 1.4 times as much as within it, along a line 0.4
+# of them: copies are closer together than that.
+_ANNULUS, _CROWDING = 2**0.5, 3.5
+
+
+def group_copies(points, *, reach, errors=None, mag=None, links=None):
+    """Say which rows are the same star.
+
+    Parameters
+    ----------
+    points : (N, d) ndarray
+        Positions in a plane or as unit vectors; all are finite.
+    reach : float
+        Largest distance of two copies, in the unit of the positions.
+    errors : (N,) ndarray, optional
+        Errors of the positions per axis, in the same unit; NaN where unknown.
+    mag : (N,) ndarray, optional
+        Magnitudes; NaN where unknown.
+    links : (i, j), optional
+        Rows that are known to be the same star two by two.
+
+    Returns
+    -------
+    (N,) ndarray of int
+        Number of the star of each row.
+
+    Notes
+    -----
+    One star are rows at exactly the same place, rows closer than five times their errors whose
+    magnitudes differ by less than one, and, where such pairs are far more than chance and double
+    stars could be, all pairs closer than a tenth of the distance between stars (and than `reach`)
+    that are equally bright to 0.1 mag, but for those four times as far apart as most of them.
+    """
+    n = len(points)
+    i, j = (np.empty(0, int), np.empty(0, int)) if links is None else links
+    places, place_of = np.unique(points, axis=0, return_inverse=True)
+    place_of = place_of.reshape(-1)
+    first = np.zeros(len(places), int)
+    first[place_of[::-1]] = np.arange(n - 1, -1, -1)
+    edges = [(i, j), (np.arange(n), first[place_of])]
+    if len(places) > 1:
+        # rows of one place go by the first of them
+        some = None if errors is None else np.asarray(errors, float)[first]
+        brightness = None if mag is None else np.asarray(mag, float)[first]
+        near = _near_pairs(places, reach, some, brightness)
+        edges.append((first[near[0]], first[near[1]]))
+    i, j = (np.concatenate(side) for side in zip(*edges, strict=True))
+    graph = coo_array((np.ones(len(i), bool), (i, j)), shape=(n, n))
+    return connected_components(graph, directed=False)[1]
+
+
+def _near_pairs(points, reach, errors, mag):
+    """Pairs of different places that are one star."""
+    n = len(points)
+    tree = cKDTree(points)
+    distant = tree.query(points, k=[min(_DISTANT, n - 1) + 1])[0][:, 0]
+    # the sixth neighbor is 1.4 times as far as stars are apart; with two copies of each, as far
+    limit = np.minimum(_REACH * distant, reach)
+    distance, other = tree.query(
+        points, k=min(_NEAR, n), distance_upper_bound=float(limit.max()) * _ANNULUS * (1 + 1e-12)
+    )
+    rows = np.repeat(np.arange(n), distance.shape[1])
+    distance, other = distance.ravel(), other.ravel()
+    near = (rows < other) & (other < n)
+    rows, other, distance = rows[near], other[near], distance[near]
+    apart = np.zeros(len(rows)) if mag is None else np.abs(mag[rows] - mag[other])
+    known = np.isfinite(apart) & (mag is not None)
+    alike = ~known | (apart <= _ALIKE)
+    share = distance / np.minimum(limit[rows], limit[other])
+    n_alike = np.count_nonzero(alike & (share <= 1.0))
+    n_around = np.count_nonzero(alike & (share > 1.0) & (share <= _ANNULUS))
+    one = np.zeros(len(rows), bool)
+    if errors is not None:
+        sigma = np.hypot(errors[rows], errors[other])
+        one |= (distance <= _N_SIGMA * sigma) & ~(known & (apart > _MOST_APART))
+    least = n * (_LEAST_SHARE_ALIKE if known.sum() > 0.5 * len(rows) else _LEAST_SHARE)
+    if n_alike > max(_LEAST_COPIES, least, _CROWDING * n_around):
+        # most of them are copies: their distances say how far apart copies are
+        typical = np.median(distance[alike & (share <= 1.0)])
+        one |= alike & (distance <= _SPREAD * typical)
+    one &= share <= 1.0
+    return rows[one], other[one]

@@ -1,0 +1,61 @@
+"""What a match is asked for."""
+
+from dataclasses import dataclass
+
+from wpdc_gwcs.matching._mapping import MAX_ORDER
+
+__all__ = ["MatchOptions"]
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """How far a match searches, and what evidence it needs.
+
+    Parameters
+    ----------
+    blind : bool
+        Search also mirrored frames, frames turned by 90, 180 and 270 degrees, scales off by up to
+        6 % and pointings off by up to 0.3 of the frame.
+    max_shift : float, optional
+        Largest error of the pointing, px; default 0.15 of the longer side, at least 450 px.
+    max_rotation : float
+        Largest error of the rotation at the centre of the frame, deg.
+    max_scale : float
+        Largest relative error of the scale at the centre of the frame.
+    max_distortion : float, optional
+        Largest displacement by distortion on the frame, px; default 250, and at most 0.12 of the
+        longer side.
+    max_order : int
+        Highest order of the smooth mapping.
+    min_significance : float
+        Significance over chance that the pairs must have, sigma; 0.7 of it do where stars are so
+        few that all mappings the search could have found are counted.
+    min_purity : float
+        Least share of right pairs.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range.
+    """
+
+    blind: bool = False
+    max_shift: float | None = None
+    max_rotation: float = 3.0
+    max_scale: float = 0.03
+    max_distortion: float | None = None
+    max_order: int = MAX_ORDER
+    # A chance of 3e-18: nine orders of magnitude are left for what the search may choose from.
+    min_significance: float = 9.0
+    # A fit with clipping bears one wrong pair in ten.
+    min_purity: float = 0.9
+
+    def __post_init__(self):
+        for name in ("max_shift", "max_rotation", "max_scale", "max_distortion"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise ValueError(f"{name} must be 0 or more, got {value}")
+        if not 1 <= self.max_order <= MAX_ORDER or self.max_order != int(self.max_order):
+            raise ValueError(f"max_order must be 1 to {MAX_ORDER}, got {self.max_order}")
+        if not 0 <= self.min_purity <= 1:
+            raise ValueError(f"min_purity must be between 0 and 1, got {self.min_purity}")

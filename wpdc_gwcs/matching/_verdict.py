@@ -1,0 +1,300 @@
+"""The verdict: pairs with their final radius, their evidence, rivals, and what is refused."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from wpdc_gwcs.exceptions import MatchError
+from wpdc_gwcs.matching._evidence import Evidence, collect_evidence, judge_few
+from wpdc_gwcs.matching._growth import (
+    SLACK,
+    final_radius,
+    fit_pairs,
+    grow,
+    grow_locally,
+    growing_radius,
+    pair,
+    predict,
+    sample_rows,
+)
+from wpdc_gwcs.matching._mapping import SmoothMap, fit_smooth_map, turn_and_scale
+from wpdc_gwcs.matching._pairs import find_edges, one_to_one
+from wpdc_gwcs.matching._problem import MIN_STARS
+from wpdc_gwcs.matching._rivals import find_rival_offset
+
+__all__ = [
+    "Attempts",
+    "Match",
+    "carry_to_frame",
+    "header_error",
+    "is_explained",
+    "judge_pairs",
+    "prefer",
+    "refusal",
+    "without_rival",
+]
+
+# Where either list has no more stars than this on the frame, the few are judged by `judge_few` too:
+# with more, right matches have enough pairs for the chance level to be counted.
+_FEW = 100
+# Significance and purity below which the pairs of a subset are not carried to the whole frame: it
+# only spares hopeless starts the full round.
+_HOPELESS_SIGNIFICANCE, _HOPELESS_PURITY = 4.0, 0.5
+# Of two matches, the one with less than this share of the evidence (in -2 ln P) of the other is
+# worse; and the better one of two is looked for so many times.
+_EQUAL = 0.7
+_MOST_RIVALS = 4
+# Pairs agree with a match within so many radii; most is more than that share.
+_EXPLAINED, _MOST = 3.0, 0.5
+# No header is right up to a rotation and yet so far off in the area of a pixel: that is a mirror.
+_MOST_STRETCH = 2.0
+
+_HINT = (
+    "if the header may be mirrored, turned by 90 degrees, off in scale by up to 5 % or off in "
+    "pointing by up to a quarter of the frame, widen the search with blind=True (--blind)"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """What a search found: the mapping, the pairs and their evidence."""
+
+    turn: np.ndarray
+    turned_mapping: SmoothMap
+    mapped: np.ndarray
+    radius: np.ndarray
+    pairs: tuple
+    n_ambiguous: int
+    scatter: float
+    evidence: Evidence
+
+    @property
+    def mapping(self):
+        """The mapping of the frame as it was given."""
+        return _turn_mapping(self.turned_mapping, self.turn)
+
+    @property
+    def parity(self):
+        """-1 where the frame is mirrored."""
+        return int(np.sign(np.linalg.det(self.turn)))
+
+
+@dataclass(frozen=True, eq=False)
+class Attempts:
+    """What has been tried without success so far."""
+
+    best: Evidence | None = None
+    # starts that were right as a whole but for a part of the frame
+    n_partial: int = 0
+
+    def after(self, evidence, *, partial=False):
+        """Return what has been tried once this evidence was not enough."""
+        best = self.best
+        if best is None or evidence.significance > best.significance:
+            best = evidence
+        return Attempts(best, self.n_partial + bool(partial))
+
+
+def carry_to_frame(problem, seed, pairs, attempts, clock):
+    """Grow first pairs of a seed's lists; rows of the pairs in the whole lists, or `None`."""
+    sources, reference = seed.sources, seed.reference
+    part = sample_rows(len(sources.points), pairs[0])
+    pairs = np.searchsorted(part, pairs[0]), pairs[1]
+    points = sources.points[part]
+    grown = grow(problem, points, sources.limit[part], reference, pairs)
+    clock.lap("grow")
+    if grown is None:
+        return None, attempts
+    fit, pairs, mapped, radius = grown
+    evidence = collect_evidence(
+        points, mapped, radius, reference, fit.mapping, pairs, problem.shape, slack=SLACK
+    )
+    clock.lap("evidence")
+    if evidence.significance < _HOPELESS_SIGNIFICANCE or evidence.purity < _HOPELESS_PURITY:
+        return None, attempts.after(evidence)
+    return seed.rows((part[pairs[0]], pairs[1])), attempts
+
+
+def judge_pairs(problem, turn, pairs, attempts, clock):
+    """Grow over all stars, pair with the final radius, judge: a `Match`, or `None`."""
+    points = problem.turned(turn)
+    fit = fit_pairs(problem, points[pairs[0]], problem.stars.points[pairs[1]])
+    if fit is None:
+        return None, attempts
+    part = sample_rows(len(points))
+    some, limit = points[part], problem.limit[part]
+    mapped, leverage = predict(some, fit, None)
+    pairs, _ = pair(mapped, growing_radius(fit, leverage), limit, problem.stars)
+    grown = grow(problem, some, limit, problem.stars, pairs)
+    if grown is None:
+        clock.lap("refine")
+        return None, attempts
+    fit, local, pairs, scatter = grow_locally(problem, some, limit, *grown[:2])
+    clock.lap("refine")
+    if len(pairs[0]) < MIN_STARS:
+        return None, attempts
+    mapped, leverage = predict(points, fit, local)
+    radius = final_radius(problem, mapped, (part[pairs[0]], pairs[1]), scatter, leverage)
+    i, j, _ = find_edges(mapped, problem.stars.tree, radius, limit=problem.stars.limit)
+    keep, n_ambiguous = one_to_one(i, j, len(points), len(problem.stars.points))
+    pairs = i[keep], j[keep]
+    clock.lap("pair")
+    evidence = collect_evidence(
+        points, mapped, radius, problem.stars, fit.mapping, pairs, problem.shape
+    )
+    if min(evidence.n_sources, evidence.n_reference) <= _FEW:
+        judged = _judge_few(problem, points, mapped, radius, leverage, fit.n_terms, pairs)
+        evidence = replace(evidence, search_significance=judged)
+    clock.lap("evidence")
+    options = problem.options
+    if evidence.missing(options):
+        # right as a whole but for a part of the frame: other starts seldom help
+        partial = evidence.is_significant(options.min_significance)
+        return None, attempts.after(evidence, partial=partial)
+    return Match(turn, fit.mapping, mapped, radius, pairs, n_ambiguous, scatter, evidence), attempts
+
+
+def _judge_few(problem, points, mapped, radius, leverage, terms, pairs):
+    limits = problem.limits
+    reach = limits.reach(limits.half_diagonal)
+    known = problem.flux is not None and problem.brightness is not None
+    return judge_few(
+        points,
+        mapped,
+        radius,
+        leverage,
+        problem.stars,
+        terms,
+        pairs,
+        problem.shape,
+        reaches=(reach, reach - limits.max_shift, limits.max_distortion),
+        brightness=(problem.flux, problem.brightness) if known else None,
+    )
+
+
+def is_explained(problem, match, i, j):
+    """Tell whether most of some candidate pairs agree with a match to within a few radii."""
+    gap = np.hypot(*(match.mapped[i] - problem.stars.points[j]).T)
+    return np.mean(gap <= _EXPLAINED * match.radius[i]) > _MOST
+
+
+def prefer(one, other):
+    """Choose the better of two matches; refuse if both are equally good and not the same."""
+    _, a, b = np.intersect1d(one.pairs[0], other.pairs[0], return_indices=True)
+    strengths = [m.evidence.significance**2 for m in (one, other)]
+    better, worse = (one, other) if strengths[0] >= strengths[1] else (other, one)
+    if len(a) and np.mean(one.pairs[1][a] == other.pairs[1][b]) > _MOST:
+        return better
+    if min(strengths) < _EQUAL * max(strengths):
+        return better
+    gap = np.median(np.hypot(*(one.mapped - other.mapped).T))
+    raise MatchError(
+        f"the match is ambiguous: {one.evidence.n_pairs} pairs "
+        f"({one.evidence.significance:.1f} sigma) and {other.evidence.n_pairs} pairs "
+        f"({other.evidence.significance:.1f} sigma) of two mappings that are {gap:.4g} px "
+        "apart suit about equally well: the field or the catalogue repeats itself"
+    )
+
+
+def without_rival(problem, match, clock):
+    """Make sure that no shift matches the same sources to other stars equally well."""
+    for _ in range(_MOST_RIVALS):
+        i, j = match.pairs
+        offset = find_rival_offset(
+            match.mapped[i],
+            j,
+            problem.stars.tree,
+            float(np.median(match.radius)),
+            center=-match.turned_mapping.linear_part()[0],
+            max_offset=problem.limits.max_shift,
+        )
+        clock.lap("rivals")
+        if offset is None:
+            return match
+        pairs, _ = pair(match.mapped + offset, match.radius, problem.limit, problem.stars)
+        if len(pairs[0]) < MIN_STARS:
+            return match
+        rival, _ = judge_pairs(problem, match.turn, pairs, Attempts(), clock)
+        if rival is None or header_error(problem, rival) is not None:
+            return match
+        better = prefer(match, rival)
+        if better is match:
+            return match
+        match = better
+    raise MatchError(
+        f"the match is ambiguous: {_MOST_RIVALS} times over another shift suited the sources "
+        "better: the field or the catalogue repeats itself"
+    )
+
+
+def header_error(problem, match):
+    """Build the error that names what is further from the header than allowed, or None.
+
+    Rotation and scale are those at the center of the frame, or those of the pairs as a whole
+    where these are closer to the header: with few pairs in a part of the frame only, the
+    mapping means nothing at the center.
+    """
+    shift, at_center = match.turned_mapping.linear_part()
+    rows = match.pairs[0]
+    place, mapped = problem.turned(match.turn)[rows], match.mapped[rows]
+    of_pairs = np.linalg.lstsq(place - place.mean(axis=0), mapped - mapped.mean(axis=0), None)[0].T
+    area = float(np.linalg.det(of_pairs))
+    if not 1 / _MOST_STRETCH < area < _MOST_STRETCH:
+        # on a narrow frame a mirror is within reach of the other limits
+        return MatchError(
+            f"the starting WCS is mirrored or stretched: the pairs change the area of the "
+            f"frame by a factor of {area:.3g}; {_HINT}"
+        )
+    turned, scaled = zip(
+        *(turn_and_scale(matrix, problem.shape) for matrix in (at_center, of_pairs)), strict=True
+    )
+    limits = problem.limits
+    for what, value, most, unit in (
+        ("pointing", float(np.hypot(*shift)), limits.max_shift, "px"),
+        ("rotation", min(np.abs(turned)), limits.max_rotation, "deg"),
+        ("scale", 100 * min(np.abs(np.subtract(scaled, 1))), 100 * limits.max_scale, "%"),
+    ):
+        if value > most:
+            return MatchError(
+                f"the {what} of the starting WCS is off by {value:.4g} {unit}, "
+                f"{most:.4g} {unit} are allowed; {_HINT}"
+            )
+    return None
+
+
+def refusal(problem, attempts, *, hint):
+    """Build the error that says what was missing."""
+    n_sources, n_reference = len(problem.sources), len(problem.stars.points)
+    if attempts.best is None:
+        reason = "no group of sources has the pattern of any group of reference stars"
+    else:
+        reason = (
+            attempts.best.missing(problem.options)
+            or "the pairs of a part do not carry over to the frame"
+        )
+    return MatchError(
+        f"no match with sufficient evidence ({n_sources} sources, {n_reference} reference stars in "
+        f"reach): {reason}" + (f"; {_HINT}" if hint else "")
+    )
+
+
+def _turn_mapping(mapping, turn):
+    """Rewrite the mapping of a turned frame as one of the frame itself, exactly."""
+    if (turn == np.eye(2)).all():
+        return mapping
+    n = mapping.order + 2
+    u, v = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    x, y = (
+        mapping.center[0] + mapping.scale * u.ravel(),
+        mapping.center[1] + mapping.scale * v.ravel(),
+    )
+    turned = (np.column_stack([x, y]) - mapping.center) @ turn.T + mapping.center
+    fit = fit_smooth_map(
+        x,
+        y,
+        *mapping(*turned.T),
+        center=mapping.center,
+        scale=mapping.scale,
+        max_order=mapping.order,
+    )
+    return fit.mapping

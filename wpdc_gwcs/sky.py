@@ -1,0 +1,112 @@
+"""The sky in arrays of plain degrees: directions, motions in space, parallax."""
+
+import numpy as np
+
+__all__ = [
+    "angles",
+    "annual_parallax",
+    "directions",
+    "move",
+]
+
+
+def directions(ra, dec):
+    """Give unit vectors towards stars, East and North of them.
+
+    Parameters
+    ----------
+    ra, dec : (N,) array_like
+        Positions, deg.
+
+    Returns
+    -------
+    outward, east, north : (3, N) ndarray
+        Unit vectors.
+    """
+    a, d = np.radians(ra), np.radians(dec)
+    ca, sa, cd, sd = np.cos(a), np.sin(a), np.cos(d), np.sin(d)
+    zero = np.zeros_like(ca)
+    return (
+        np.stack([cd * ca, cd * sa, sd]),
+        np.stack([-sa, ca, zero]),
+        np.stack([-sd * ca, -sd * sa, cd]),
+    )
+
+
+def angles(vector):
+    """Give the position that a vector points at.
+
+    Parameters
+    ----------
+    vector : (3, N) array_like
+        Of any length.
+
+    Returns
+    -------
+    ra, dec : (N,) ndarray
+        Position, deg; right ascension from 0 to 360.
+    """
+    x, y, z = vector
+    return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+
+
+def move(ra, dec, pmra, pmdec, years):
+    """Move stars straight on in space, with a radial velocity of zero.
+
+    Parameters
+    ----------
+    ra, dec : (N,) ndarray
+        Positions, deg.
+    pmra, pmdec : (N,) ndarray
+        Proper motions, mas / yr; that in right ascension includes cos Dec.
+    years : (N,) ndarray or float
+        How long, yr.
+
+    Returns
+    -------
+    ra, dec : (N,) ndarray
+        Positions, deg.
+    pmra, pmdec : (N,) ndarray
+        The motion as it is seen then, mas / yr: moving on or back starts from there.
+    """
+    r, east, north = directions(ra, dec)
+    mas = np.pi / 180.0 / 3.6e6
+    motion = (pmra * east + pmdec * north) * mas
+    later = r + motion * years
+    length = np.sqrt((later**2).sum(axis=0))
+    new = later / length
+    new_ra, new_dec = angles(new)
+    motion = (motion - new * (new * motion).sum(axis=0)) / length
+    _, east, north = directions(new_ra, new_dec)
+    return (
+        new_ra,
+        new_dec,
+        (motion * east).sum(axis=0) / mas,
+        (motion * north).sum(axis=0) / mas,
+    )
+
+
+def annual_parallax(ra, dec, parallax, epoch):
+    """Shift stars by their annual parallax as seen from the Earth's centre.
+
+    Parameters
+    ----------
+    ra, dec : (N,) ndarray
+        Positions seen from the barycentre, deg.
+    parallax : (N,) ndarray
+        Parallaxes, mas.
+    epoch : float
+        Julian year.
+
+    Returns
+    -------
+    ra, dec : (N,) ndarray
+        Apparent positions, deg.
+    """
+    # erfa's Earth needs no ephemeris file, hence no network.
+    import erfa
+
+    barycentric = erfa.epv00(2451545.0, (epoch - 2000.0) * 365.25)[1]["p"]
+    r, _, _ = directions(ra, dec)
+    mas = np.pi / 180.0 / 3.6e6
+    return angles(r - parallax * mas * np.asarray(barycentric)[:, None])
