@@ -52,7 +52,10 @@ _ZOOMS, _SEEN = 2, 0.5
 _MOST_ZOOMED = 60
 
 # With more stars than this they are averaged in cells, so many along the shortest wave.
-_MOST_STARS, _CELLS_PER_WAVE = 20_000, 20
+_MOST_STARS, _CELLS_PER_WAVE = 20_000, 16
+
+# Stars of which the columns are held in memory at once.
+_BLOCK = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,18 +252,26 @@ def _factor(normal, root):
 
 def _normal_equations(shape, focal, residual, weight):
     """Take free polynomials out of the normal matrix and the right-hand sides."""
-    rows = _columns(*shape, focal)
-    free = _polynomials(*shape[:2], focal, range(shape[3]))
-    heavy = rows * weight[:, None]
-    normal, right = heavy.T @ rows, heavy.T @ residual.T
-    cross = free.T @ heavy
-    solved = np.linalg.lstsq(
-        (free * weight[:, None]).T @ free,
-        np.hstack([cross, free.T @ (weight * residual).T]),
-        rcond=1e-12,
-    )[0]
+    total = 0.0
+    for start in range(0, len(weight), _BLOCK):
+        s = slice(start, start + _BLOCK)
+        rows = [
+            _columns(*shape, focal[:, s]),
+            _polynomials(*shape[:2], focal[:, s], range(shape[3])),
+            residual[:, s].T,
+        ]
+        rows = np.hstack(rows) * np.sqrt(weight[s, None])
+        total = total + rows.T @ rows
+    k, f = len(total) - 2, sum(range(shape[3] + 1))
+    shapes, free = slice(k - f), slice(k - f, k)
+    cross = total[free, shapes]
+    solved = np.linalg.lstsq(total[free, free], np.hstack([cross, total[free, k:]]), rcond=1e-12)[0]
     taken = solved[:, :-2]
-    return normal - cross.T @ taken, right - cross.T @ solved[:, -2:], taken
+    return (
+        total[shapes, shapes] - cross.T @ taken,
+        total[shapes, k:] - cross.T @ solved[:, -2:],
+        taken,
+    )
 
 
 def _averaged(focal, residual, weight, side):
