@@ -312,14 +312,18 @@ def learn_spectra(frames, make, *, start, scales, force=False):
     Notes
     -----
     Maximum a posteriori: the logarithms of amplitude and scale of an exposure scatter by 1 and 0.7
-    about the pooled ones.
+    about the pooled ones.  A field that all exposures have in common, by evidence, is none of
+    theirs.
     """
     if not frames:
         return {}
     # A few frames tell what all have in common.
     step = -(-len(frames) // _EXPOSURES_POOLED)
     some = [f for e in sorted(frames)[::step] for f in frames[e][:_FRAMES_POOLED]]
-    spectrum = pooled_spectrum([make(f, KINDS) for f in some], start=start, scales=scales)
+    patches = [make(f, KINDS) for f in some]
+    spectrum = pooled_spectrum(patches, start=start, scales=scales)
+    if spectrum is not None and _is_common(patches, spectrum):
+        spectrum = None
     if spectrum is None and not force:
         return dict.fromkeys(frames)
     if spectrum is None:
@@ -331,6 +335,22 @@ def learn_spectra(frames, make, *, start, scales, force=False):
         # a field, the amplitude is small.
         found[e], _ = _maximize(group, spectrum.kind, start, scales, about=spectrum)
     return found
+
+
+def _is_common(patches, spectrum):
+    """Tell whether all exposures of a detector have the same field: then it is the detector's."""
+    each = common = 0.0
+    for basis in {id(p.basis): p.basis for p in patches}.values():
+        mine = [p for p in patches if p.basis is basis]
+        if len(mine) > 1:
+            matrix, right = (
+                {spectrum.kind: sum(getattr(p, part)[spectrum.kind] for p in mine)}
+                for part in ("matrix", "right")
+            )
+            together = Products(basis, matrix, right, sum(p.n_stars for p in mine))
+            each += sum(p.log_evidence(spectrum) for p in mine)
+            common += together.log_evidence(spectrum)
+    return common > each
 
 
 def pooled_spectrum(patches, *, start, scales):

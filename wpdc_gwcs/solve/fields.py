@@ -86,8 +86,11 @@ def with_spectra(o, state, *, force=False):
     for f in state.active:
         if counts[f] > 0:
             groups.setdefault(int(o.exposure_of[f]), []).append(f)
+    # The same detectors in all exposures, those with the most stars.
+    total = np.bincount(o.detector_of, counts, len(o.detectors))
     frames = {
-        e: sorted(fs, key=lambda f: -counts[f])[:_FRAMES_PER_EXPOSURE] for e, fs in groups.items()
+        e: sorted(fs, key=lambda f: -total[o.detector_of[f]])[:_FRAMES_PER_EXPOSURE]
+        for e, fs in groups.items()
     }
     plain = replace(state, spectra={}, bases=bases)
 
