@@ -13,7 +13,8 @@ from astropy.table import QTable, Table
 
 from wpdc_gwcs.calibration.camera import cameras_of, solve_camera
 from wpdc_gwcs.calibration.exposures import tie_exposures
-from wpdc_gwcs.calibration.matched import FailedFrame, match_frame, measure_sources
+from wpdc_gwcs.calibration.matched import FailedFrame, match_frame
+from wpdc_gwcs.calibration.measure import measure_sources
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.camera import build_camera

@@ -20,6 +20,7 @@ from astropy.table import Table
 
 from wpdc_gwcs.catalogs import table_format
 from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
+from wpdc_gwcs.flags import FLAG_BAD_PIXEL, FLAG_BLENDED, FLAG_EDGE, FLAG_SATURATED
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.io.dates import header_epoch, header_start
 from wpdc_gwcs.io.exposures import camera_key, exposure_key, has_identifier
@@ -629,8 +630,6 @@ def standardize_sources(table, *, name="sources"):
 
 def _sextractor_flags(flags, external):
     """Translate FLAGS and IMAFLAGS_ISO of SExtractor."""
-    from wpdc_gwcs.detection import FLAG_BAD_PIXEL, FLAG_BLENDED, FLAG_EDGE, FLAG_SATURATED
-
     ours = np.zeros_like(flags)
     # 2 deblended, 4 saturated, 8 truncated, 16 aperture incomplete, above: memory overflows
     for theirs, flag in (
