@@ -18,8 +18,9 @@ _MIN_LOCAL = 120
 # Sources whose roundness is more than noise, by signal-to-noise ratio; without any, all.
 _ROUND_SNR = 30.0
 _MIN_ROUND = 10
-# Scatter of the roundness by noise, times the signal-to-noise ratio.
-_ROUNDNESS_NOISE = 2.5
+# Scatter of the roundness by noise, times the signal-to-noise ratio, and how many times that counts.
+_ROUNDNESS_NOISE = 1.0
+_N_SIGMA = 2.5
 
 
 def select_sources(sources, *, image_shape=None, max_roundness=MAX_ROUNDNESS, min_snr=MIN_SNR):
@@ -95,9 +96,9 @@ def judge_sources(sources, *, image_shape=None, max_roundness=MAX_ROUNDNESS, min
         roundness = _column(sources, "roundness")
         if roundness is not None:
             clean = ~np.any(list(rules.values()), axis=0)
-            off = np.abs(_roundness_difference(x, y, np.asarray(roundness, float), snr, clean))
-            noise = _ROUNDNESS_NOISE / np.where(snr > 0, snr, np.inf)
-            rules["not round"] = off > np.hypot(max_roundness, noise)
+            off, scatter = _roundness_difference(x, y, roundness, snr, clean)
+            noise = np.hypot(scatter, _ROUNDNESS_NOISE / np.where(snr > 0, snr, np.inf))
+            rules["not round"] = np.abs(off) > np.hypot(max_roundness, _N_SIGMA * noise)
     seen = np.zeros(len(x), bool)
     for name, out in rules.items():
         rules[name] = out & ~seen
@@ -138,27 +139,32 @@ def _column(sources, name):
 
 
 def _roundness_difference(x, y, roundness, snr, clean):
-    """Difference of the roundness from that of the stars of the frame, or of its part of it."""
+    """Difference of the roundness from that of the stars of the frame or of its part, and scatter.
+
+    The scatter is that of bright stars about what is typical of them.
+    """
     known = clean & np.isfinite(roundness)
     bright = known & ~(snr < _ROUND_SNR)
     known = bright if bright.sum() >= _MIN_ROUND else known
     rows = np.flatnonzero(known)
     if len(rows) < _MIN_ROUND:
         # Of a handful the middle one is as good a guess as any.
-        return roundness - (np.median(roundness[rows]) if len(rows) > 2 else 0.0)
-    typical = np.full(len(x), _most_frequent(roundness[rows]))
+        return roundness - (np.median(roundness[rows]) if len(rows) > 2 else 0.0), 0.0
+    typical = np.full(len(x), _crowded_half(roundness[rows])[0])
     if len(rows) >= _MIN_LOCAL:
         placed = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
         tree = KDTree(np.column_stack([x[rows], y[rows]]))
         _, near = tree.query(np.column_stack([x[placed], y[placed]]), k=_NEIGHBORS)
         typical[placed] = np.median(roundness[rows][near], axis=1)
-    return roundness - typical
+    difference = roundness - typical
+    return difference, _crowded_half(difference[rows])[1]
 
 
-def _most_frequent(values):
-    """Middle of the shortest half of the values: what stars have in common."""
+def _crowded_half(values):
+    """Middle and scatter of the shortest half of the values: what stars have in common."""
     values = np.sort(values)
     n = (len(values) + 1) // 2
     width = values[n - 1 :] - values[: len(values) - n + 1]
     first = int(np.argmin(width))
-    return float(np.median(values[first : first + n]))
+    # Half of a normal distribution lies within 0.674 standard deviations.
+    return float(np.median(values[first : first + n])), float(width[first] / 1.349)

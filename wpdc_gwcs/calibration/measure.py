@@ -100,15 +100,14 @@ def measure_sources(frame, settings=None):
     sources.meta["noise"] = background.noise
     if settings.min_snr == 0:
         return sources
-    # The fit's own ratio is the greater one, but for sources whose aperture is full of others.
-    snr = np.minimum(detected["flux"] / detected["flux_err"], sources["snr"])
-    if not np.any(snr > settings.min_snr):
+    bright = np.asarray(sources["snr"], float) >= settings.min_snr
+    if not bright.any():
         raise DetectionError(
             f"{frame.source}: none of {len(sources)} sources has a signal-to-noise ratio above "
             f"{settings.min_snr:g}"
         )
-    sources.meta["n_faint"] = int(np.count_nonzero(~(snr > settings.min_snr)))
-    return sources[snr > settings.min_snr]
+    sources.meta["n_faint"] = int(np.count_nonzero(~bright))
+    return sources[bright]
 
 
 def _first_gain(frame, settings, background):

@@ -46,6 +46,10 @@ _NEGLIGIBLE = 0.05
 _CHUNK = 10_000
 # Error of the PSF, relative, below which a residual is no sign of another star.
 _MODEL_ERROR = 0.1
+# Error of the PSF, relative, up to which it is as smooth as its width tells; and the FWHM in px of
+# the finest structure looked for otherwise.
+_FAIR_MISMATCH = 0.03
+_FINEST = 1.4
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
 
@@ -138,7 +142,20 @@ def _learn(field, stars, fwhm, gain, vary):
     shape = fit_moffat(field, noise, stars.take(slice(200)), fwhm, half=half, radius=wide)
     start = Profile.constant(moffat_samples(shape, half, OVERSAMPLING), OVERSAMPLING)
     options = {"fwhm": fwhm, "radius": radius, "gain": gain}
-    profile, stars, noise = learn_profile(field, noise, stars, start, iterations=4, **options)
+    chosen = stars
+    profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=4, **options)
+    finest = fwhm
+    while noise.mismatch > _FAIR_MISMATCH and finest > 2 * _FINEST:
+        # Rings and trails have edges that are finer than they are wide.
+        finest = max(0.5 * finest, _FINEST)
+        finer = learn_profile(
+            field, noise, chosen, start, iterations=4, **(options | {"finest": finest})
+        )
+        enough = len(finer[1].x) >= max(_MIN_STARS, len(stars.x) // 2)
+        if not (enough and finer[2].mismatch < noise.mismatch):
+            break
+        profile, stars, noise = finer
+        options["finest"] = finest
     n = len(stars.x)
     if n < _MIN_STARS:
         return None

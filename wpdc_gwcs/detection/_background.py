@@ -244,7 +244,7 @@ def _in_units(data, pedestal, unit):
 
 
 def _relative_noise(weight, bad):
-    """Standard deviation that a weight map gives the sky, relative to its median over the image."""
+    """Noise of the sky by a weight map, relative to its median over the image."""
     variance = np.full(weight.shape, np.nan, dtype=np.float32)
     good = np.isfinite(weight) & (weight > 0)
     if bad is not None:

@@ -5,12 +5,15 @@ import sep
 
 from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, cutouts, mode, sizes, window
 
-__all__ = ["extract_peaks", "star_size", "typical_fwhm"]
+__all__ = ["extract_peaks", "is_broad", "star_size", "typical_fwhm"]
 
 # Smoothing before the threshold: close to a matched filter for FWHM 1.5 to 3 px, and narrow enough
 # not to merge neighbours.
 _KERNEL = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]) / 16
-_KERNEL_NOISE = np.sqrt((_KERNEL**2).sum())
+
+# Stars broader than this, FWHM in px, would fall to pieces under that kernel: the noise makes peaks
+# of their own on rings and trails.
+_BROAD = 4.5
 
 # Rows searched at a time, and their overlap: every source is taken whole, from the strip that holds
 # its peak.
@@ -21,7 +24,7 @@ _OVERLAP = 64
 _N_BRIGHT = 500
 
 
-def extract_peaks(background, threshold, deblend_contrast):
+def extract_peaks(background, threshold, deblend_contrast, fwhm=0.0):
     """Extract peaks with sep.
 
     Parameters
@@ -32,6 +35,8 @@ def extract_peaks(background, threshold, deblend_contrast):
         Least significance of a peak.
     deblend_contrast : float
         Least share of the flux of a peak within a larger source.
+    fwhm : float, optional
+        Of the stars, px; broad ones are looked for with a filter as broad.
 
     Returns
     -------
@@ -41,7 +46,8 @@ def extract_peaks(background, threshold, deblend_contrast):
     image, rms, mask = background.image, background.rms, background.mask
     # sep's defaults are for small images: it gives up where more pixels or branches are active.
     sep.set_sub_object_limit(8192)
-    threshold = threshold * _KERNEL_NOISE
+    kernel = _kernel(fwhm)
+    threshold = threshold * np.sqrt((kernel**2).sum())
     parts = []
     # In strips, because sep compares every source with every other one.
     for first in range(0, image.shape[0], _STRIP):
@@ -58,7 +64,7 @@ def extract_peaks(background, threshold, deblend_contrast):
             err=rms[start:stop],
             mask=None if mask is None else mask[start:stop],
             minarea=3,
-            filter_kernel=_KERNEL,
+            filter_kernel=kernel,
             filter_type="conv",
             deblend_cont=deblend_contrast,
         )
@@ -66,6 +72,32 @@ def extract_peaks(background, threshold, deblend_contrast):
             part[name] += start
         parts.append(part[(part["ycpeak"] >= first) & (part["ycpeak"] < last)])
     return np.concatenate(parts)
+
+
+def is_broad(fwhm):
+    """Tell whether stars of this FWHM in px need a broader filter.
+
+    Parameters
+    ----------
+    fwhm : float
+        Of the stars, px.
+
+    Returns
+    -------
+    bool
+        True from 4.5 px on.
+    """
+    return fwhm > _BROAD
+
+
+def _kernel(fwhm):
+    """Filter of unit sum for stars of this FWHM."""
+    if not is_broad(fwhm):
+        return _KERNEL
+    sigma = fwhm * SIGMA_PER_FWHM
+    step = np.arange(-int(2 * sigma), int(2 * sigma) + 1)
+    line = np.exp(-0.5 * (step / sigma) ** 2)
+    return np.outer(line, line) / line.sum() ** 2
 
 
 def typical_fwhm(background, found):

@@ -8,7 +8,7 @@ from astropy.table import Table, vstack
 from scipy.spatial import KDTree
 
 from wpdc_gwcs.detection._background import Background, subtract_background
-from wpdc_gwcs.detection._extract import extract_peaks, typical_fwhm
+from wpdc_gwcs.detection._extract import extract_peaks, is_broad, typical_fwhm
 from wpdc_gwcs.detection._hits import mask_hits
 from wpdc_gwcs.detection._saturation import plateau
 from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, measure_shapes, mode
@@ -116,6 +116,8 @@ def detect_sources(
     if saturation is None:
         saturation = plateau(data)
     fwhm = typical_fwhm(data, found)
+    if is_broad(fwhm):
+        found = extract_peaks(data, threshold, deblend_contrast, fwhm)
     table = _measure(data, found, fwhm, gain, saturation)
     table.meta.update(fwhm=fwhm, saturation=saturation)
     log.info(
@@ -176,8 +178,8 @@ def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_co
     """
     if not threshold > 0:
         raise ValueError(f"threshold must be positive, got {threshold}")
-    found = extract_peaks(residual, threshold, deblend_contrast)
     fwhm = sources.meta["fwhm"]
+    found = extract_peaks(residual, threshold, deblend_contrast, fwhm)
     result = sources.copy()
     if len(found):
         new = _measure(residual, found, fwhm, gain, sources.meta["saturation"])

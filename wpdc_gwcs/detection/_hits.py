@@ -106,6 +106,7 @@ def _sharper(peak, pairs, noise, fwhm):
     root = np.sqrt(8 * np.log(2)) / fwhm / np.sqrt(2)
     inner, outer = erf(0.5 * root), 0.5 * (erf(1.5 * root) - erf(0.5 * root))
     ratio = outer / inner
-    expected = _MARGIN * np.array([ratio, ratio, ratio**2, ratio**2])[:, None]
+    # A diagonal step is one along each axis.
+    expected = np.array([_MARGIN * ratio] * 2 + [(_MARGIN * ratio) ** 2] * 2)[:, None]
     light = pairs + _NOISE / np.sqrt(2) * noise
     return (light < expected * (peak - _NOISE * noise)).any(axis=0)

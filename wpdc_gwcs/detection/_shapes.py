@@ -160,7 +160,11 @@ def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, saturation):
         y_err = 2 * np.sqrt((noise.sum(2) * dy**2).sum(1)) / signal
     positive = signal > 0
     major, minor = sizes(pixels, dx, dy, weight, sigma)
-    roundness, sharpness = daofind_shape(image, xpeak, ypeak, sigma)
+    # About the centroid where there is light all around it: rings have no peak in the middle.
+    central = np.hypot(xc - xpeak, yc - ypeak) <= fwhm
+    roundness, sharpness = daofind_shape(
+        image, np.where(central, xc, xpeak), np.where(central, yc, ypeak), sigma
+    )
     return {
         "x_err": np.where(positive, x_err, np.nan),
         "y_err": np.where(positive, y_err, np.nan),
