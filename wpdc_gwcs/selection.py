@@ -18,7 +18,7 @@ _MIN_LOCAL = 120
 # Sources whose roundness is more than noise, by signal-to-noise ratio; without any, all.
 _ROUND_SNR = 30.0
 _MIN_ROUND = 10
-# Scatter of the roundness by noise, times the signal-to-noise ratio, and how many times that counts.
+# Scatter of the roundness by noise, times the signal-to-noise ratio; how many times it counts.
 _ROUNDNESS_NOISE = 1.0
 _N_SIGMA = 2.5
 

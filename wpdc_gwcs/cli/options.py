@@ -13,12 +13,19 @@ from wpdc_gwcs.exceptions import InputError
 
 __all__ = [
     "Config",
+    "Gain",
+    "Mask",
+    "MaskBits",
+    "MaxMag",
+    "MaxRoundness",
     "MinSNR",
     "Overwrite",
     "Preset",
     "Quiet",
+    "Saturation",
     "Threshold",
     "Verbose",
+    "WeightMap",
     "require_free",
     "require_plotting",
 ]
@@ -123,6 +130,43 @@ MinSNR = Annotated[
     float,
     typer.Option(
         metavar="RATIO", help="Least signal-to-noise ratio of a source kept; 0 keeps all."
+    ),
+]
+
+MaxRoundness = Annotated[
+    float,
+    typer.Option(
+        metavar="R", help="Greatest difference from the roundness that the frame's stars have."
+    ),
+]
+MaxMag = Annotated[
+    float | None,
+    typer.Option(metavar="MAG", help="Magnitude of the faintest reference stars used."),
+]
+Gain = Annotated[
+    float | None,
+    typer.Option(metavar="E/COUNT", help="Electrons per count, in place of the header's."),
+]
+Saturation = Annotated[
+    float | None,
+    typer.Option(metavar="COUNTS", help="Level of saturated pixels, in place of the header's."),
+]
+Mask = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE[EXT]", help="Pixels that must not be used, in place of the file's own."
+    ),
+]
+MaskBits = Annotated[
+    int | None,
+    typer.Option(
+        metavar="SUM", help="Bits of masks that are bad; default: those that the pixels bear out."
+    ),
+]
+WeightMap = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE[EXT]", help="Inverse variances of the sky, in place of the file's own."
     ),
 ]
 

@@ -7,21 +7,35 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.calibrate import Catalog, WcsFile
-from wpdc_gwcs.cli.options import MinSNR, Overwrite, Quiet, Threshold, Verbose, require_free
+from wpdc_gwcs.cli.options import (
+    Gain,
+    Mask,
+    MaskBits,
+    MaxMag,
+    MaxRoundness,
+    MinSNR,
+    Overwrite,
+    Quiet,
+    Saturation,
+    Threshold,
+    Verbose,
+    WeightMap,
+    require_free,
+)
 from wpdc_gwcs.exceptions import InputError
 
 Table = Annotated[Path, typer.Option("--output", metavar="FILE", help="Table to write (ECSV).")]
 
 
-def one_frame(path, *, wcs=None):
+def one_frame(path, **options):
     """Read the single frame of a file.
 
     Parameters
     ----------
     path : str
         FITS image or source list; ``path[EXT]`` chooses an extension.
-    wcs : str, optional
-        Starting WCS of a source table.
+    **options
+        As for `wpdc_gwcs.io.read_frames`.
 
     Returns
     -------
@@ -30,7 +44,7 @@ def one_frame(path, *, wcs=None):
     """
     from wpdc_gwcs.io import read_frames
 
-    frames = read_frames(path, wcs=wcs)
+    frames = read_frames(path, **options)
     if len(frames) > 1:
         names = ", ".join(frame.source for frame in frames)
         raise InputError(f"{path}: has {len(frames)} frames, choose one with path[EXT]: {names}")
@@ -46,6 +60,11 @@ def detect_command(
     ] = "psf",
     threshold: Threshold = 5.0,
     min_snr: MinSNR = 10.0,
+    gain: Gain = None,
+    saturation: Saturation = None,
+    mask: Mask = None,
+    mask_bits: MaskBits = None,
+    weight_map: WeightMap = None,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
@@ -56,10 +75,17 @@ def detect_command(
 
     require_free(output, overwrite)
     try:
-        settings = Settings(centroids=centroids, threshold=threshold, min_snr=min_snr)
+        settings = Settings(
+            centroids=centroids,
+            threshold=threshold,
+            min_snr=min_snr,
+            gain=gain,
+            saturation=saturation,
+        )
     except ValueError as err:
         raise InputError(str(err)) from err
-    sources = measure_sources(one_frame(frame), settings)
+    planes = {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
+    sources = measure_sources(one_frame(frame, **planes), settings)
     write_table(sources, output, overwrite=overwrite)
     if not quiet:
         clean = int((sources["flags"] == 0).sum())
@@ -75,6 +101,14 @@ def match_command(
     catalog: Catalog,
     output: Table,
     wcs: WcsFile = None,
+    min_snr: MinSNR = 10.0,
+    max_roundness: MaxRoundness = 0.3,
+    max_mag: MaxMag = None,
+    gain: Gain = None,
+    saturation: Saturation = None,
+    mask: Mask = None,
+    mask_bits: MaskBits = None,
+    weight_map: WeightMap = None,
     blind: Annotated[
         bool,
         typer.Option(
@@ -94,7 +128,19 @@ def match_command(
     from wpdc_gwcs.matching import pair_table
 
     require_free(output, overwrite)
-    matched = match_frame(one_frame(frame, wcs=wcs), read_catalog(catalog), Settings(blind=blind))
+    try:
+        settings = Settings(
+            blind=blind,
+            min_snr=min_snr,
+            max_roundness=max_roundness,
+            max_mag=max_mag,
+            gain=gain,
+            saturation=saturation,
+        )
+    except ValueError as err:
+        raise InputError(str(err)) from err
+    planes = {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
+    matched = match_frame(one_frame(frame, wcs=wcs, **planes), read_catalog(catalog), settings)
     i, j = matched.pairs
     x, y = (np.asarray(matched.sources[name], float)[i] for name in ("x", "y"))
     ra, dec = (np.asarray(matched.reference[name], float)[j] for name in ("ra", "dec"))
