@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.table import Table
 
-from wpdc_gwcs.calibration.measure import measure_sources
+from wpdc_gwcs.calibration.measure import measure_sources, rules_of
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import (
     LinearWCS,
@@ -19,7 +19,7 @@ from wpdc_gwcs.calibration.start import (
 from wpdc_gwcs.catalogs import fill_motions, propagate, select_cone
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
-from wpdc_gwcs.selection import judge_sources, left_out
+from wpdc_gwcs.selection import left_out
 
 __all__ = [
     "FailedFrame",
@@ -129,7 +129,7 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
             blind=settings.blind,
         )
     except MatchError as err:
-        raise MatchError(f"{err} ({left_out(_rules(sources, frame, settings))})") from err
+        raise MatchError(f"{err} ({left_out(rules_of(sources, frame, settings))})") from err
     log.info("%s: %d of %d sources matched", frame.name, len(i_src), len(sources))
     return MatchedFrame(
         name=frame.name,
@@ -210,16 +210,7 @@ def usable_sources(sources, frame, settings):
     (N,) ndarray of bool
         Mask over the sources, see `wpdc_gwcs.matching.select_sources`.
     """
-    return ~np.any(list(_rules(sources, frame, settings).values()), axis=0)
-
-
-def _rules(sources, frame, settings):
-    return judge_sources(
-        sources,
-        image_shape=frame.image_shape,
-        max_roundness=settings.max_roundness,
-        min_snr=settings.min_snr,
-    )
+    return ~np.any(list(rules_of(sources, frame, settings).values()), axis=0)
 
 
 def reference_in_reach(frame, catalog, start, settings):

@@ -15,8 +15,9 @@ from wpdc_gwcs.detection import (
     subtract_background,
 )
 from wpdc_gwcs.exceptions import DetectionError, WPDCWarning
+from wpdc_gwcs.selection import judge_sources, left_out
 
-__all__ = ["measure_sources"]
+__all__ = ["measure_sources", "quality_of", "rules_of"]
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,11 @@ _MAX_GAIN_RATIO = 2.5
 _GOOD_MISMATCH = 0.03
 # Stars that prove it.
 _MIN_STARS = 20
+
+# Signal-to-noise ratio in an aperture that holds all the light of a star, over that of the fit:
+# 2 sigma / (1.5 FWHM) for a Gaussian and a radius of 1.5 FWHM, a little more with its photons.  The ratio in an
+# aperture is what the limit is about, and the fit's is the less noisy measure of it, for any PSF.
+_APERTURE_SHARE = 0.6
 
 
 def measure_sources(frame, settings=None):
@@ -91,7 +97,7 @@ def measure_sources(frame, settings=None):
         if epsf is not None:
             noise = measure_noise(background, detected, epsf)
             if settings.gain is None and _contradicts(gain, noise):
-                _warn(frame, "gain", gain, f"the noise in its stars is that of {noise.gain:.3g}")
+                _warn(frame, "gain", gain, f"the noise in its stars is that of a gain of {noise.gain:.3g}")
                 gain = noise.gain
                 detected = detect_sources(background, gain=gain, **options)
                 epsf = build_epsf(background, detected, gain=gain)
@@ -100,7 +106,8 @@ def measure_sources(frame, settings=None):
     sources.meta["noise"] = background.noise
     if settings.min_snr == 0:
         return sources
-    bright = np.asarray(sources["snr"], float) >= settings.min_snr
+    snr = np.asarray(sources["snr"], float)
+    bright = (_APERTURE_SHARE if "chi2" in sources.colnames else 1.0) * snr >= settings.min_snr
     if not bright.any():
         raise DetectionError(
             f"{frame.source}: none of {len(sources)} sources has a signal-to-noise ratio above "
@@ -108,6 +115,59 @@ def measure_sources(frame, settings=None):
         )
     sources.meta["n_faint"] = int(np.count_nonzero(~bright))
     return sources[bright]
+
+
+def quality_of(frame, sources, settings):
+    """Tell what a frame is like: its PSF and noise, and how many sources each rule leaves out.
+
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+    sources : `~astropy.table.Table` or None
+        As from `measure_sources`.
+    settings : Settings
+        ``max_roundness`` and ``min_snr`` are used.
+
+    Returns
+    -------
+    dict
+        ``fwhm`` (px), ``ellipticity``, ``mismatch`` (error of the PSF at its peak, relative),
+        ``gain`` (electrons per count, as measured), ``noise`` (counts), each NaN where it has not
+        been measured, and ``left_out``.
+    """
+    meta = {} if sources is None else sources.meta
+    result = {}
+    for name in ("fwhm", "ellipticity", "mismatch", "gain", "noise"):
+        value = meta.get(name)
+        result[name] = float(value) if isinstance(value, int | float) else np.nan
+    result["left_out"] = "" if sources is None else left_out(rules_of(sources, frame, settings))
+    return result
+
+
+def rules_of(sources, frame, settings):
+    """Judge the sources of a frame by the rules of the settings.
+
+    Parameters
+    ----------
+    sources : `~astropy.table.Table`
+        What was measured.
+    frame : Frame
+        Its shape counts.
+    settings : Settings
+        ``max_roundness`` and ``min_snr`` are used.
+
+    Returns
+    -------
+    dict
+        As from `wpdc_gwcs.selection.judge_sources`.
+    """
+    return judge_sources(
+        sources,
+        image_shape=frame.image_shape,
+        max_roundness=settings.max_roundness,
+        min_snr=settings.min_snr,
+    )
 
 
 def _first_gain(frame, settings, background):

@@ -31,6 +31,9 @@ _MAX_SHARE = 0.15
 # Nearest that two sources are told apart, in FWHM.
 _RESOLVED = 0.6
 
+# Sources that tell what stars look like, by signal-to-noise ratio.
+_STAR_SNR = 30.0
+
 # Sources measured at a time: bounds the memory for their cut-outs to some tens of MB.
 _CHUNK = 20_000
 
@@ -69,7 +72,7 @@ def detect_sources(
         One row per source, in the order found: ``x``, ``y`` (windowed centroid, px, zero based),
         ``x_err``, ``y_err`` (px), ``flux``, ``flux_err`` (counts), ``snr``, ``peak`` (counts above
         background), ``fwhm`` (px), ``roundness``, ``sharpness``, ``flags``.  The meta data holds
-        ``fwhm``, that of a typical star, and ``saturation``.
+        ``fwhm`` and ``ellipticity``, those of a typical star, and ``saturation``.
 
     Raises
     ------
@@ -217,6 +220,7 @@ def _measure(background, found, fwhm, gain, saturation):
     shapes["peak"] *= unit
     flags |= _unlike_stars(minor, size, shapes["snr"], flags)
     shapes["fwhm"] = np.where(np.isfinite(size), size, np.nan)
+    ellipticity = _ellipticity(minor, size, shapes["snr"], flags)
     flags |= np.where(_blended(x, y, flux, fwhm), FLAG_BLENDED, 0)
     return Table(
         {"x": x, "y": y}
@@ -224,7 +228,7 @@ def _measure(background, found, fwhm, gain, saturation):
         | {"flux": flux * unit, "flux_err": flux_err * unit}
         | shapes
         | {"flags": flags},
-        meta={},
+        meta={"ellipticity": ellipticity},
     )
 
 
@@ -241,10 +245,18 @@ def _windowed(background, found, sigma, fwhm):
     return np.where(ran_away, x, xw), np.where(ran_away, y, yw)
 
 
+def _ellipticity(minor, size, snr, flags):
+    """Find 1 - minor/major of a typical star, NaN without any."""
+    with np.errstate(invalid="ignore"):
+        value = 1 - minor / np.sqrt(2 * size**2 - minor**2)
+    good = (flags == 0) & (snr > _STAR_SNR) & np.isfinite(value)
+    return mode(value[good])[0] if good.any() else np.nan
+
+
 def _unlike_stars(minor, size, snr, flags):
     """Flag what is clearly sharper or broader than the stars of this image."""
     result = np.zeros(len(size), int)
-    bright = (flags == 0) & (snr > 30) & np.isfinite(size)
+    bright = (flags == 0) & (snr > _STAR_SNR) & np.isfinite(size)
     if bright.sum() < 10:
         bright = (flags == 0) & np.isfinite(size)
     if bright.sum() < 10:
