@@ -36,8 +36,8 @@ _GOOD_MISMATCH = 0.03
 _MIN_STARS = 20
 
 # Signal-to-noise ratio in an aperture that holds all the light of a star, over that of the fit:
-# 2 sigma / (1.5 FWHM) for a Gaussian and a radius of 1.5 FWHM, a little more with its photons.  The ratio in an
-# aperture is what the limit is about, and the fit's is the less noisy measure of it, for any PSF.
+# 2 sigma / (1.5 FWHM) for a Gaussian and a radius of 1.5 FWHM, a little more with its photons.  The
+# limit is about the ratio in an aperture; the fit's is the less noisy measure of it, for any PSF.
 _APERTURE_SHARE = 0.6
 
 
@@ -97,7 +97,12 @@ def measure_sources(frame, settings=None):
         if epsf is not None:
             noise = measure_noise(background, detected, epsf)
             if settings.gain is None and _contradicts(gain, noise):
-                _warn(frame, "gain", gain, f"the noise in its stars is that of a gain of {noise.gain:.3g}")
+                _warn(
+                    frame,
+                    "gain",
+                    gain,
+                    f"the noise in its stars is that of a gain of {noise.gain:.3g}",
+                )
                 gain = noise.gain
                 detected = detect_sources(background, gain=gain, **options)
                 epsf = build_epsf(background, detected, gain=gain)

@@ -287,7 +287,8 @@ def subtract_stars(background, sources, epsf, *, gain=None):
     model = render(background.image.shape, profile, stars)
     variance = background.rms.astype(np.float32) ** 2 + (_MODEL_ERROR * model) ** 2
     if gain is not None:
-        variance += np.maximum(model, 0) / (gain * background.unit)
+        photons = np.maximum(model, 0) / (gain * background.unit)
+        variance += photons if background.photons is None else photons * background.photons
     return replace(background, image=background.image - model, rms=np.sqrt(variance))
 
 
@@ -403,7 +404,7 @@ def _disturbed(field, model, profile, own, radius):
         shares = profile.shares(stars.x, stars.y)
         mine = profile.evaluate(stars.x - xc, stars.y - yc, half, shares, gradient=False)[0]
         light = pixels - stars.flux[:, None] * mine
-        limit = _NEGLIGIBLE * (np.sqrt(sky) + 0.01 * np.abs(pixels))
+        limit = _NEGLIGIBLE * (np.sqrt(sky.variance) + 0.01 * np.abs(pixels))
         result.append(start + np.flatnonzero((use & (np.abs(light) > limit)).any(axis=1)))
     return np.concatenate(result) if result else np.zeros(0, int)
 
@@ -471,11 +472,11 @@ def _field_of(data, error, saturation=None):
         if error is not None:
             raise ValueError("error must not be given: the Background has its own")
         if saturation is None:
-            return Field(data.image, data.rms, data.mask), data.unit
+            return Field(data.image, data.rms, data.mask, data.photons), data.unit
         # The wings of a saturated star still tell its flux, which matters to its neighbours.
         full = data.data >= saturation
         mask = full if data.mask is None else full | data.mask
-        return Field(data.image, data.rms, mask), data.unit
+        return Field(data.image, data.rms, mask, data.photons), data.unit
     image = np.asarray(data)
     if image.ndim != 2:
         raise ValueError(f"the image must be 2-D, got {image.ndim} dimensions")

@@ -47,6 +47,9 @@ class Background:
     unit : float, optional
         Counts in one unit of `image` and `rms`: 1 but for images whose noise is so small or great
         in counts that squares of float32 would not hold it.
+    photons : (ny, nx) float32 ndarray or None, optional
+        Variance of a star's photons relative to what the gain says, where pixels differ in response
+        or exposure, which a weight map or the filters of a mosaic tell; None elsewhere.
     """
 
     image: np.ndarray
@@ -55,6 +58,7 @@ class Background:
     level: float
     data: np.ndarray
     unit: float = 1.0
+    photons: np.ndarray | None = None
 
     @property
     def noise(self):
@@ -182,12 +186,15 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3)
         else:
             flat = sep.Background(part / relative[plane], **cells)
             rms[plane] = flat.rms(dtype=np.float32) * relative[plane]
+    photons = None if relative is None else _relative_photons(relative)
     if period > 1:
+        photons = np.ones(data.shape, np.float32) if photons is None else photons
         for plane, response in zip(planes, star_responses(image, rms, bad), strict=True):
             image[plane] /= response
             rms[plane] /= response
+            photons[plane] /= response
     return _finished(
-        Background(image, rms, bad, pedestal + float(np.mean(levels)) * unit, data, unit)
+        Background(image, rms, bad, pedestal + float(np.mean(levels)) * unit, data, unit, photons)
     )
 
 
@@ -241,6 +248,17 @@ def _in_units(data, pedestal, unit):
         with np.errstate(over="ignore", invalid="ignore"):
             image[rows] = (data[rows].astype(float) - pedestal) / unit
     return image
+
+
+def _relative_photons(relative):
+    """Variance of photons where pixels differ in response or exposure by this noise of the sky.
+
+    With response s it goes as 1/s, that of the sky as 1/s if its own photons make it, as 1/s^2 if
+    the readout does: between the two.  The gain is that of the best pixels.
+    """
+    step = max(1, min(relative.shape) // 500)
+    best = np.percentile(relative[::step, ::step], 5)
+    return (relative / best) ** 1.5
 
 
 def _relative_noise(weight, bad):

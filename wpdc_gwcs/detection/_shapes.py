@@ -151,7 +151,10 @@ def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, saturation):
         flags |= np.where((full & core).any((1, 2)), FLAG_SATURATED, 0)
     variance = cutouts(background.rms, xc, yc, half).astype(float) ** 2
     if gain is not None:
-        variance += np.maximum(pixels, 0) / gain
+        photons = np.maximum(pixels, 0) / gain
+        if background.photons is not None:
+            photons *= cutouts(background.photons, xc, yc, half)
+        variance += photons
     signal = (weight * pixels).sum((1, 2))
     noise = weight**2 * variance
     with np.errstate(divide="ignore", invalid="ignore"):
