@@ -38,7 +38,7 @@ _MIN_STARS = 20
 # Signal-to-noise ratio in an aperture that holds all the light of a star, over that of the fit:
 # 2 sigma / (1.5 FWHM) for a Gaussian and a radius of 1.5 FWHM, a little more with its photons.  The
 # limit is about the ratio in an aperture; the fit's is the less noisy measure of it, for any PSF.
-_APERTURE_SHARE = 0.6
+_APERTURE_SHARE = 0.61
 
 
 def measure_sources(frame, settings=None):

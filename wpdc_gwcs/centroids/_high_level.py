@@ -147,15 +147,13 @@ def _learn(field, stars, fwhm, gain, vary):
     finest = fwhm
     while noise.mismatch > _FAIR_MISMATCH and finest > 2 * _FINEST:
         # Rings and trails have edges that are finer than they are wide.
-        finest = max(0.5 * finest, _FINEST)
-        finer = learn_profile(
-            field, noise, chosen, start, iterations=4, **(options | {"finest": finest})
-        )
-        enough = len(finer[1].x) >= max(_MIN_STARS, len(stars.x) // 2)
-        if not (enough and finer[2].mismatch < noise.mismatch):
-            break
-        profile, stars, noise = finer
-        options["finest"] = finest
+        finest = max(0.25 * finest, _FINEST)
+        finer = options | {"iterations": 4, "finest": finest}
+        found = learn_profile(field, noise, chosen, profile, **finer)
+        if len(found[1].x) >= max(_MIN_STARS, len(stars.x) // 2):
+            if found[2].mismatch < noise.mismatch:
+                options["finest"] = finest
+                profile, stars, noise = found
     n = len(stars.x)
     if n < _MIN_STARS:
         return None
