@@ -68,9 +68,12 @@ def judge_sources(sources, *, image_shape=None, max_roundness=MAX_ROUNDNESS, min
 
     Parameters
     ----------
-    sources, image_shape, max_roundness, min_snr
-        As for `select_sources`; the sources may also be a mapping of columns, `None` for those
-        that are not there.
+    sources : `~astropy.table.Table` or mapping
+        As for `select_sources`; of a mapping, columns that are not there may be `None`.
+    image_shape : (int, int), optional
+        Shape ``(ny, nx)`` of the detector, where those beside it are to be left out.
+    max_roundness, min_snr : float, optional
+        As for `select_sources`.
 
     Returns
     -------

@@ -57,14 +57,16 @@ _BAD_PLANES = frozenset(
 # Telescopes whose lowest bit sums up the others.
 _DO_NOT_USE = ("JWST", "ROMAN")
 
-# A bit is looked at before it is believed if so large a share of the pixels has it.
-_SHARE = 0.01
+# A bit is looked at before it is believed if more than this share of the pixels has it: for marking
+# sources, and for saying nothing, which it can only for areas that no defects cover.
+_FEW, _SHARE = 0.001, 0.05
 # Pixels like the rest: their median to a standard deviation, their scatter within a factor, their
 # share of outliers within a factor and a floor.
 _MEDIAN, _SCATTER, _OUTLIERS, _OUTLIER_FLOOR = 1.0, 1.4, 2.0, 0.003
 _N_SAMPLE = 200_000
-# A bit of sources: it has most of the bright pixels, and these lie side by side.
-_BRIGHT, _OF_SOURCES, _CONNECTED = 5.0, 0.5, 0.7
+# A bit of sources: its pixels lie side by side and are most of those that are bright (in standard
+# deviations), but not so bright that they are saturated.
+_BRIGHT, _TOO_BRIGHT, _OF_SOURCES, _CONNECTED = 5.0, 50.0, 0.5, 0.7
 
 
 @dataclass(frozen=True)
@@ -79,11 +81,14 @@ class Companion:
         Number of the extension.
     role : {"mask", "weight", "error", "variance", "other"}
         What its pixels say.
+    given : bool, optional
+        Whether the user named it: then all that it marks is bad.
     """
 
     path: str
     index: int
     role: str
+    given: bool = False
 
 
 def pair_companions(hdus, images, path):
@@ -230,7 +235,7 @@ def given_plane(path, frame_index, frame_name, shape, role):
         own = _role_of(hdus[index])
     if role == "weight" and own in ("error", "variance"):
         role = own
-    return Companion(str(plain), index, role)
+    return Companion(str(plain), index, role, given=True)
 
 
 def data_section(header, shape):
@@ -291,7 +296,7 @@ def load_mask(masks, section, shape, bits, load_image):
     for mask in masks:
         values, header = _read(mask, shape)
         values = np.where(np.isfinite(values), values, 0).astype(np.int64)
-        bad |= _bad_pixels(values, header, bits, load_image, f"{mask.path}[{mask.index}]")
+        bad |= _bad_pixels(values, header, bits, load_image, mask)
     if section is not None:
         outside = np.ones(shape, bool)
         outside[section] = False
@@ -299,11 +304,12 @@ def load_mask(masks, section, shape, bits, load_image):
     return bad
 
 
-def _bad_pixels(values, header, bits, load_image, where):
+def _bad_pixels(values, header, bits, load_image, mask):
     if bits is not None:
         return values & bits != 0
-    if not values.any():
+    if mask.given or not values.any():
         return values != 0
+    where = f"{mask.path}[{mask.index}]"
     named = {k[3:]: v for k, v in header.items() if k.startswith("MP_") and isinstance(v, int)}
     if named:
         bits = sum(1 << v for name, v in named.items() if name in _BAD_PLANES)
@@ -318,9 +324,10 @@ def _bad_pixels(values, header, bits, load_image, where):
     clean, image = values == 0, None
     for bit in (1 << k for k in range(63) if present >> k & 1):
         has = values & bit != 0
-        if has.mean() > _SHARE:
+        if has.mean() > _FEW:
             image = load_image() if image is None else image
-            if _says_nothing(image, has, clean):
+            alone = values == bit
+            if _says_nothing(image, has, alone if alone.any() else has, clean):
                 log.info("%s: bit %d is ignored: its pixels are good", where, bit)
                 continue
         bad |= has
@@ -330,26 +337,31 @@ def _bad_pixels(values, header, bits, load_image, where):
     return bad
 
 
-def _says_nothing(image, has, clean):
-    """Whether the pixels that have a bit are like those that have none, or are those of sources."""
+def _says_nothing(image, has, alone, clean):
+    """Whether the pixels that have a bit are like those that have none, or are those of sources.
+
+    The bit alone is compared, where others are not the reason for what the pixels look like.
+    """
     rest = _sample(image[clean])
     if rest.size < 100:
         return False
     middle, scatter = _spread(rest)
-    own = _sample(image[has & np.isfinite(image)])
+    own = _sample(image[alone])
     if own.size < 100 or not scatter > 0:
         return False
     level, spread = _spread(own)
+    bright = (image > middle + _BRIGHT * scatter) & (image < middle + _TOO_BRIGHT * scatter)
+    beside = (has[:, 1:] & has[:, :-1]).sum() / max(has.sum(), 1)
+    if bright.any() and np.mean(has[bright]) > _OF_SOURCES and beside > _CONNECTED:
+        return True
+    if has.mean() < _SHARE:
+        return False
     outliers = [np.mean(np.abs(v - middle) > _BRIGHT * scatter) for v in (own, rest)]
-    alike = (
+    return bool(
         abs(level - middle) < _MEDIAN * scatter
         and scatter / _SCATTER < spread < scatter * _SCATTER
         and outliers[0] < _OUTLIERS * outliers[1] + _OUTLIER_FLOOR
     )
-    bright = image > middle + _BRIGHT * scatter
-    beside = (has[:, 1:] & has[:, :-1]).sum() / max(has.sum(), 1)
-    sources = np.mean(has[bright]) > _OF_SOURCES if bright.any() else False
-    return bool(alike or (sources and beside > _CONNECTED))
 
 
 def _sample(values):
