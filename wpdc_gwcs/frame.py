@@ -30,7 +30,7 @@ class Frame:
         Returns the image as a float array ``[y, x]``; called once, when needed.
     load_sources : callable, optional
         Returns the source table (``x``, ``y`` zero based, optional ``x_err``, ``y_err``, ``flux``,
-        ``snr``, ``roundness``, ``flags``).  Exactly one of the two loaders is given.
+        ``snr``, ``roundness``, ``flags``).  Exactly one of this and ``load_image`` is given.
     gain, saturation : float, optional
         Electrons per count and saturation level in counts, from the header.
     exposure : str, optional
@@ -40,6 +40,9 @@ class Frame:
         Name of the camera, whose detectors share a focal plane; `None`: the detector is on its own.
     meta : dict
         Other facts of the header worth keeping (filter, exposure time, ...).
+    load_mask, load_weight : callable, optional
+        Return what goes with the image: an array of bool, true where a pixel must not be used, and
+        one of weights, inverse variances of the sky of any scale.
 
     Raises
     ------
@@ -69,6 +72,8 @@ class Frame:
     exposure: str | None = None
     camera: str | None = None
     meta: dict = field(default_factory=dict)
+    load_mask: Callable | None = None
+    load_weight: Callable | None = None
 
     def __post_init__(self):
         if (self.load_image is None) == (self.load_sources is None):

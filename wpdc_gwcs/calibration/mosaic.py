@@ -145,7 +145,10 @@ def _solve(plane, results, catalog, settings, solution):
                 continue
             if prediction.shift <= _NARROWER * tried.get(name, np.inf):
                 tried[name] = prediction.shift
-                new[name] = _task(plane.frames[name], failed[name], solution), prediction
+                new[name] = (
+                    _task(plane.frames[name], failed[name], solution, settings),
+                    prediction,
+                )
         found = _match_all(new, catalog, settings)
         for name in found:
             log.info("%s: matched from its neighbors", name)
@@ -233,12 +236,12 @@ def _contradicted(plane, geometry, matched, known):
     return min(disagreement, key=disagreement.get)
 
 
-def _task(frame, result, solution):
+def _task(frame, result, solution, settings):
     sources = with_errors(result.sources)
     if isinstance(solution, Mapping):
         solution = solution.get(frame.detector)
     crpix = header_reference_point(frame) if solution is None else np.asarray(solution.crpix)
-    return _Task(frame, sources, usable_sources(sources, frame.image_shape), crpix)
+    return _Task(frame, sources, usable_sources(sources, frame, settings), crpix)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,8 @@ from astropy.table import QTable, Table
 
 from wpdc_gwcs.calibration.camera import cameras_of, solve_camera
 from wpdc_gwcs.calibration.exposures import tie_exposures
-from wpdc_gwcs.calibration.matched import FailedFrame, match_frame, measure_sources
+from wpdc_gwcs.calibration.matched import FailedFrame, match_frame
+from wpdc_gwcs.calibration.measure import measure_sources, quality_of
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.camera import build_camera
@@ -154,7 +155,7 @@ def calibrate(
         failures.update(failed)
     progress("solve", len(groups), len(groups))
     ordered = [calibrations[n] for n in names if n in calibrations]
-    summary = _summarize(frames, results, calibrations, failures)
+    summary = _summarize(frames, results, calibrations, failures, settings)
     return CalibrationRun(ordered, solutions, failures, summary, superseded, cameras)
 
 
@@ -328,7 +329,7 @@ def _holdout_mask(catalog, settings):
     return np.random.default_rng(settings.seed).uniform(size=size) < settings.holdout
 
 
-def _summarize(frames, results, calibrations, failures):
+def _summarize(frames, results, calibrations, failures, settings):
     """One row per frame, whatever became of it."""
     rows = []
     for frame in frames:
@@ -360,10 +361,11 @@ def _summarize(frames, results, calibrations, failures):
             row[f"holdout_{name}"] = outside.get(name, np.nan)
         row["rms_mas"] = statistics.get("rms_mas", np.nan)
         row["seconds"] = statistics.get("seconds", result.seconds)
+        row |= quality_of(frame, result.sources, settings)
         rows.append(row)
     table = QTable(rows)
     for name in table.colnames:
         if "_d" in name:
             table[name].unit = "pix"
-    table["rms_mas"].unit, table["seconds"].unit = "mas", "s"
+    table["rms_mas"].unit, table["seconds"].unit, table["fwhm"].unit = "mas", "s", "pix"
     return table

@@ -14,14 +14,21 @@ from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import (
     Config,
     Epoch,
+    Gain,
+    Mask,
+    MaskBits,
+    MaxMag,
+    MaxRoundness,
     MinSNR,
     Origin,
     Overwrite,
     PixelScale,
     Preset,
     Quiet,
+    Saturation,
     Threshold,
     Verbose,
+    WeightMap,
     by_hand,
     require_plotting,
     state_first_pixel,
@@ -150,6 +157,13 @@ def calibrate_command(
     ] = "header",
     threshold: Threshold = 5.0,
     min_snr: MinSNR = 10.0,
+    max_roundness: MaxRoundness = 0.3,
+    max_mag: MaxMag = None,
+    gain: Gain = None,
+    saturation: Saturation = None,
+    mask: Mask = None,
+    mask_bits: MaskBits = None,
+    weight_map: WeightMap = None,
     blind: Annotated[
         bool,
         typer.Option(
@@ -216,6 +230,10 @@ def calibrate_command(
             reference_point=reference_point,
             threshold=threshold,
             min_snr=min_snr,
+            max_roundness=max_roundness,
+            max_mag=max_mag,
+            gain=gain,
+            saturation=saturation,
             blind=blind,
             holdout=holdout,
             seed=seed,
@@ -225,6 +243,7 @@ def calibrate_command(
 
     keys = {"exposure_keyword": exposure_key, "camera": not no_camera}
     keys |= by_hand(epoch, pixel_scale, origin)
+    keys |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
     loaded = [f for path in frames for f in read_frames(path, wcs=wcs, detector=detector, **keys)]
     results = Results(output, loaded, overwrite=overwrite)
     if report:
