@@ -55,8 +55,8 @@ def error_of(capsys):
 def test_calibrate_writes_what_it_promises(results, simulation):
     names = sorted(p.name for p in results.iterdir())
     assert names == [
-        "sim-01.matches.ecsv", "sim-01.wcs.asdf", "sim-02.matches.ecsv", "sim-02.wcs.asdf",
-        "sim.solution.asdf", "summary.ecsv",
+        "manifest.json", "sim-01.matches.ecsv", "sim-01.wcs.asdf", "sim-02.matches.ecsv",
+        "sim-02.wcs.asdf", "sim.solution.asdf", "summary.ecsv",
     ]  # fmt: skip
     summary = Table.read(results / "summary.ecsv")
     assert list(summary["status"]) == ["solved", "solved"]

@@ -24,6 +24,7 @@ from wpdc_gwcs.matching import match_planes
 __all__ = [
     "FailedFrame",
     "MatchedFrame",
+    "catalog_of_frame",
     "match_frame",
     "measure_sources",
     "optional_column",
@@ -193,11 +194,10 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     sources = with_errors(sources)
     usable = usable_sources(sources, frame.image_shape)
     x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)
+    start = _start(frame, solution)
     if solution is None:
-        start = linear_wcs(frame.wcs, header_reference_point(frame))
         xs, ys = start.pixels(*sky_of(frame.wcs, x, y))
     else:
-        start = linear_wcs(frame.wcs, solution.crpix)
         xs, ys = solution.undistort(x, y)
     reference = reference_in_reach(frame, catalog, start, settings)
     xr, yr = start.pixels(np.asarray(reference["ra"]), np.asarray(reference["dec"]))
@@ -305,6 +305,44 @@ def usable_sources(sources, image_shape):
     return usable
 
 
+def _start(frame, solution):
+    """Linear WCS about which a frame is matched."""
+    point = header_reference_point(frame) if solution is None else solution.crpix
+    return linear_wcs(frame.wcs, point)
+
+
+def _reach(frame, start, settings):
+    """Center and radius, deg, of the sky in which a match of the frame is sought."""
+    ny, nx = frame.image_shape
+    center = detector_center(frame.image_shape)
+    ra, dec = (float(c) for c in np.ravel(sky_of(frame.wcs, *center[:, None])))
+    # As wide as the match searches, see `match_planes`.
+    margin = max(nx, ny) * (0.5 if settings.blind else 0.2) + 500
+    return ra, dec, (np.hypot(nx, ny) / 2 + margin) * start.scale
+
+
+def catalog_of_frame(frame, catalog, settings, *, solution=None):
+    """Cut the reference catalogue to what a frame can need, to be handed to another process.
+
+    Parameters
+    ----------
+    frame : Frame
+        Its WCS tells where.
+    catalog : `~astropy.table.Table`
+        Reference catalogue whose motions have been filled.
+    settings : Settings
+        A blind search needs more.
+    solution : DistortionSolution, optional
+        Stored solution of the detector.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        Rows of the catalogue, from which `match_frame` selects the same stars as from all.
+    """
+    return select_cone(catalog, *_reach(frame, _start(frame, solution), settings))
+
+
 def reference_in_reach(frame, catalog, start, settings):
     """Select the reference stars that the frame can show, at its epoch.
 
@@ -329,12 +367,7 @@ def reference_in_reach(frame, catalog, start, settings):
     MatchError
         If there are none.
     """
-    ny, nx = frame.image_shape
-    center = detector_center(frame.image_shape)
-    ra, dec = (float(c) for c in np.ravel(sky_of(frame.wcs, *center[:, None])))
-    # As wide as the match searches, see `match_planes`.
-    margin = max(nx, ny) * (0.5 if settings.blind else 0.2) + 500
-    radius = (np.hypot(nx, ny) / 2 + margin) * start.scale
+    ra, dec, radius = _reach(frame, start, settings)
     # Before the cut, which would take neighbours away; in a run it has been done for all frames.
     near = select_cone(fill_motions(catalog), ra, dec, radius)
     if len(near) == 0:

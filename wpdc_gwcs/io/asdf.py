@@ -46,7 +46,7 @@ from wpdc_gwcs.lookup import ResidualMap
 from wpdc_gwcs.models import LookupTable, PVPolynomial
 from wpdc_gwcs.solution import Calibration, DistortionSolution
 
-__all__ = ["read_asdf", "read_asdf_wcs", "write_asdf", "write_stock"]
+__all__ = ["read_asdf", "read_asdf_wcs", "sum_of", "write_asdf", "write_stock"]
 
 # Tables with files of their own, and what only the file of the detector itself needs.
 _NOT_STORED = {"matches", "sources"}
@@ -117,6 +117,22 @@ def write_stock(obj, path, *, overwrite=False):
     _write_tree({"wcs": wcs}, path, overwrite)
     shape = obj.solution.image_shape if isinstance(obj, Calibration) else obj.image_shape
     return None if shape is None else deviation(obj, wcs, n=101)
+
+
+def sum_of(obj):
+    """Sum over all that is in a result.
+
+    Parameters
+    ----------
+    obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or `~wpdc_gwcs.Camera`
+        The result.
+
+    Returns
+    -------
+    sum : str
+        See `wpdc_gwcs.io.integrity.content_sum`.
+    """
+    return content_sum(_fields_of(obj, _NOT_STORED))
 
 
 def read_asdf(path):
