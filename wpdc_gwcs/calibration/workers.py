@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import connection, get_context, parent_process
+from multiprocessing import connection, get_context, parent_process, resource_tracker
 from multiprocessing.reduction import ForkingPickler
 
 from astropy.table import Table
@@ -169,6 +169,8 @@ class Workers:
         self._closed = False
         self._futures = []
         if executor is None and jobs > 1:
+            # Else the first process that is started starts it, and hears Ctrl-C again thereafter.
+            resource_tracker.ensure_running()
             self._threads = ThreadPoolExecutor(jobs, initializer=_ignore_interrupts)
 
     def __enter__(self):
