@@ -467,7 +467,7 @@ def split_extension(path):
     if found is None or Path(text).exists():
         return Path(text), None
     extension = found[2].strip()
-    return Path(found[1]), int(extension) if extension.isdigit() else extension
+    return Path(found[1]), int(extension) if re.fullmatch("[0-9]{1,9}", extension) else extension
 
 
 def _is_fits(path):

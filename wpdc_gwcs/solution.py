@@ -268,8 +268,8 @@ class Calibration:
         each axis, with X, Y in px from the reference point.
     reference_color : float, optional
         Color that the WCS is for, mag.
-    matches, sources : QTable, optional
-        Pairs and sources of the frame.
+    matches, sources : `~astropy.table.Table`, optional
+        Pairs and sources of the frame, with units.
     statistics, settings, provenance : dict
         How the calibration came about.
     """

@@ -42,6 +42,12 @@ _MIN_SNR = 10.0
 
 _ERROR_FLOOR = 0.01  # px
 
+# Images smaller than this, px, have no background, and no stars on it.
+_SMALLEST = 8
+
+# Scales of the two axes of a header that differ by more are no scales.
+_MOST_CONDITION = 1e6
+
 # Rounds after which close pairs have shared out their light.
 _PASSES_OF_PAIRS = 6
 
@@ -117,6 +123,11 @@ def measure_sources(frame, settings=None):
     if settings.centroids == "given":
         raise DetectionError(
             f"{frame.source}: centroids 'given' needs a source list, and this is an image"
+        )
+    if min(frame.image_shape) < _SMALLEST:
+        raise DetectionError(
+            f"{frame.source}: the image must be at least {_SMALLEST} x {_SMALLEST} px, is of shape "
+            f"(ny, nx) {frame.image_shape}"
         )
     image = frame.load_image()
     background = subtract_background(image)
@@ -308,7 +319,13 @@ def usable_sources(sources, image_shape):
 def _start(frame, solution):
     """Linear WCS about which a frame is matched."""
     point = header_reference_point(frame) if solution is None else solution.crpix
-    return linear_wcs(frame.wcs, point)
+    start = linear_wcs(frame.wcs, point)
+    if not np.linalg.cond(start.cd) < _MOST_CONDITION:
+        raise MatchError(
+            f"{frame.source}: the starting WCS must be invertible, its matrix is "
+            f"{start.cd.tolist()} deg / px at pixel {point.tolist()}"
+        )
+    return start
 
 
 def _reach(frame, start, settings):

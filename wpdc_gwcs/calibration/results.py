@@ -29,11 +29,13 @@ try:
 except ImportError:  # a system without locks of this kind
     fcntl = None
 
-__all__ = ["FRAME_SUFFIXES", "Outcome", "ResultFolder", "file_stem", "superseded_name"]
+__all__ = ["ERRORS", "FRAME_SUFFIXES", "Outcome", "ResultFolder", "file_stem", "superseded_name"]
 
 #: Files of a frame, in the order in which they get their names.
 FRAME_SUFFIXES = (".sources.ecsv", ".matches.ecsv", ".wcs.asdf")
-_SUMMARY, _MANIFEST, _ERRORS = "summary.ecsv", "manifest.json", "errors.log"
+#: Where the details of internal errors are.
+ERRORS = "errors.log"
+_SUMMARY, _MANIFEST = "summary.ecsv", "manifest.json"
 _REMOVED = "removed.json"
 
 
@@ -441,7 +443,7 @@ class ResultFolder:
         Path
             The file that they are in, after what is there already.
         """
-        path = self.folder / _ERRORS
+        path = self.folder / ERRORS
         with path.open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{self._manifest.run} {name}: {error}\n{error.details}\n")
         return path

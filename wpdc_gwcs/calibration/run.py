@@ -283,7 +283,7 @@ def _log_details(name, error, folder):
     if folder is None:
         log.error("%s: %s\n%s", name, error, error.details)
     else:
-        log.error("%s: %s (details in %s)", name, error, folder.log(name, error))
+        log.info("%s: %s: details in %s", name, error, folder.log(name, error))
 
 
 def _joined(frames, outcomes, run_id, resumed):

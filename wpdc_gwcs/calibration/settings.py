@@ -1,6 +1,9 @@
 """Choices of a calibration."""
 
 from dataclasses import dataclass
+from numbers import Integral
+
+import numpy as np
 
 from wpdc_gwcs.fitting import RadialWeight
 
@@ -84,6 +87,12 @@ class Settings:
             raise ValueError(f"holdout must be between 0 and 0.9, got {self.holdout}")
         if not self.threshold > 0:
             raise ValueError(f"threshold must be positive, got {self.threshold}")
+        if not (isinstance(self.seed, Integral) and 0 <= self.seed < 1 << 63):
+            raise ValueError(f"seed must be an integer from 0 to 2^63 - 1, got {self.seed!r}")
+        if not (self.threshold < np.inf and self.min_snr < np.inf):
+            raise ValueError(
+                f"threshold and min_snr must be finite, got {self.threshold} and {self.min_snr}"
+            )
         if not self.min_snr >= 0:
             raise ValueError(f"min_snr must be 0 or more, got {self.min_snr}")
 

@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import threading
+import traceback
 import warnings
 from contextlib import contextmanager
 from typing import Annotated
@@ -173,6 +174,12 @@ def _run(args, received):
         if err.filename is None:
             return _fail(err.strerror or err, 2)
         return _fail(f"{err.filename}: {err.strerror}", 2)
+    except MemoryError as err:
+        return _fail(f"not enough memory: {err}", 1)
+    except Exception as err:  # noqa: BLE001  A mistake of ours, told in one line like those of others.
+        if logging.getLogger("wpdc_gwcs").isEnabledFor(logging.DEBUG):
+            traceback.print_exception(err)
+        return _fail(f"internal error: {type(err).__name__}: {err} (-vv shows where)", 1)
 
 
 def _usage(err):

@@ -23,7 +23,7 @@ from wpdc_gwcs.cli.options import (
 )
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.cli.report import write_page
-from wpdc_gwcs.exceptions import InputError
+from wpdc_gwcs.exceptions import InputError, InternalError
 
 log = logging.getLogger("wpdc_gwcs.cli")
 
@@ -197,6 +197,7 @@ def calibrate_command(
     of the summary says why.
     """
     from wpdc_gwcs.calibration import Settings, calibrate
+    from wpdc_gwcs.calibration.results import ERRORS
     from wpdc_gwcs.io import read_frames
 
     if report:
@@ -266,7 +267,8 @@ def calibrate_command(
                 "%s: degraded: %s", calibration.frame, "; ".join(calibration.statistics["reasons"])
             )
     for name, error in run.failures.items():
-        log.error("%s: not solved: %s", name, error)
+        details = f" (details in {output / ERRORS})" if isinstance(error, InternalError) else ""
+        log.error("%s: not solved: %s%s", name, error, details)
     if any(isinstance(error, InputError) for error in run.failures.values()):
         raise typer.Exit(2)
     if run.failures:

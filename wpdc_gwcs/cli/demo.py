@@ -114,7 +114,10 @@ def demo_command(
 
     require_plotting("the demo")
     began = time.perf_counter()
-    simulation = simulate(5, distortion=40.0, seed=seed)
+    try:
+        simulation = simulate(5, distortion=40.0, seed=seed)
+    except ValueError as err:
+        raise InputError(str(err)) from err
     files = write_files(simulation, output / "input", images=(0,), overwrite=overwrite)
     frames = [frame for path in files["frames"] for frame in read_frames(path)]
     with progress_bar(quiet=quiet) as progress:

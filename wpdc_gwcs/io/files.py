@@ -49,6 +49,8 @@ READ_ERRORS = (
 )
 _BLOCK = 2880
 _LONGEST_ENDING = 16
+# The standard has no more axes, and no file system files of more bytes.
+_MOST_AXES, _MOST_BYTES = 999, 1 << 63
 _OPENERS = {"gzip": gzip.open, "bzip2": bz2.open, "xz": lzma.open}
 _MAGIC = (
     (b"\x1f\x8b", "gzip"),
@@ -285,6 +287,10 @@ def _walk(file, path, error, size):
             return
         position += header.pop("length")
         bits = abs(header.get("BITPIX", 8))
+        for keyword, value in header.items():
+            most = _MOST_AXES if keyword == "NAXIS" else _MOST_BYTES
+            if keyword != "BITPIX" and not 0 <= value <= most:
+                raise error(f"{path}: {keyword} of HDU {number} must be 0 to {most}, is {value}")
         axes = [header.get(f"NAXIS{i + 1}", 0) for i in range(header.get("NAXIS", 0))]
         if header.get("GROUPS") and axes and axes[0] == 0:
             axes = axes[1:]
