@@ -298,6 +298,26 @@ def test_a_frame_is_handed_only_its_part_of_the_catalogue(frames, inputs):
     assert max(handed) <= len(whole)
 
 
+def test_a_scheduler_without_workers_is_given_up(inputs, tmp_path, capsys):
+    distributed = pytest.importorskip("distributed")
+    arguments = ["calibrate", str(inputs[0][0]), "--catalog", str(inputs[1])]
+    arguments += ["--output", str(tmp_path / "out"), "--scheduler-timeout", "2"]
+    with distributed.LocalCluster(
+        n_workers=0, processes=False, dashboard_address=None, protocol="tcp", host="127.0.0.1"
+    ) as cluster:
+        began = time.monotonic()
+        assert command([*arguments, "--scheduler", cluster.scheduler_address]) == 2
+        assert time.monotonic() - began < 15
+        lines = capsys.readouterr().err.splitlines()
+        assert "the Dask scheduler has no worker yet; waiting at most 2 s" in lines[0]
+        assert lines[1:] == [
+            f"wpdc: error: --scheduler {cluster.scheduler_address}: must have a worker within 2 s, "
+            "has none"
+        ]
+    assert command([*arguments, "--scheduler", "tcp://127.0.0.1:1"]) == 2
+    assert "no Dask scheduler answers there" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("moment", ["part", "done"])
 def test_a_run_that_was_killed_is_completed_by_the_next(
     frames, inputs, tmp_path, monkeypatch, moment
