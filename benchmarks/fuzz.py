@@ -30,7 +30,7 @@ from wpdc_gwcs.cli.app import run
 from wpdc_gwcs.io import read_frames
 from wpdc_gwcs.simulation import write_simulation
 
-LONGEST = 20.0  # s
+LONGEST = 20.0  # s of this process, whatever else the machine does
 SCALE = 0.3  # arcsec / px
 SAME = 1e-9  # px, what a WCS may be off by where the file is still accepted
 ODD_VALUES = ["nan", "inf", "-inf", "1e400", "1e30", "-1e30", "0", "-1", "1e-300", "''", "null",
@@ -284,7 +284,7 @@ def cases(inputs, work, n, seed):
 def answer(command):
     """Exit status, output and errors of a command; a traceback or hang in place of the status."""
     out, err = io.StringIO(), io.StringIO()
-    signal.setitimer(signal.ITIMER_REAL, LONGEST)
+    signal.setitimer(signal.ITIMER_PROF, LONGEST)
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             status = run(command)
@@ -294,7 +294,7 @@ def answer(command):
         status = "traceback"
         err.write(traceback.format_exc())
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_PROF, 0)
     if "Traceback" in err.getvalue() or "internal error" in err.getvalue():
         status = "traceback"
     return status, out.getvalue(), err.getvalue()
@@ -308,7 +308,7 @@ def main():
     def ring(number, frame):
         raise Hang
 
-    signal.signal(signal.SIGALRM, ring)
+    signal.signal(signal.SIGPROF, ring)
     base = Path(tempfile.mkdtemp())
     (base / "in").mkdir()
     inputs = make_inputs(base / "in")
@@ -317,9 +317,9 @@ def main():
     truth = np.array(read(inputs["wcs"]).wcs(x, y))
     counts, slowest = {}, 0.0
     for number, (kind, command, keeps) in enumerate(cases(inputs, base / "work", n, seed)):
-        began = time.perf_counter()
+        began = time.process_time()
         status, out, err = answer(command)
-        slowest = max(slowest, time.perf_counter() - began)
+        slowest = max(slowest, time.process_time() - began)
         lines = [line for line in err.splitlines() if line.startswith("wpdc: error: ")]
         verdict = {0: "accepted", 1: "refused", 2: "refused"}.get(status, str(status))
         if verdict == "refused" and (not lines or len(lines) < len(err.splitlines()) - 3):

@@ -338,7 +338,7 @@ def test_a_run_that_was_killed_is_completed_by_the_next(
         if moment == "part":
             patch.setattr(ResultFolder, "_write_state", lambda *a: stopping(None, None))
         else:
-            patch.setattr(results_module, "_move", stopping)
+            patch.setattr(results_module, "put_in_place", stopping)
         with pytest.raises(Stopped):
             calibrate(frames, inputs[1], output=tmp_path, overwrite=True)
     assert [p for p in tmp_path.iterdir() if p.name.startswith(".")]
@@ -352,6 +352,13 @@ def test_a_run_that_was_killed_is_completed_by_the_next(
         assert runs[frames[0].name] != first.run_id == runs[frames[1].name]
     again = calibrate(frames, inputs[1], output=tmp_path, resume=True)
     assert len(set(check_sets(tmp_path).values())) == 1
+    # What is not ours stays.
+    others = [tmp_path / ".film.part", tmp_path / ".0123456789ab.party", tmp_path / ".x.done"]
+    for other in others:
+        other.mkdir()
+    with ResultFolder(tmp_path):
+        pass
+    assert all(other.exists() for other in others)
     assert len(again.resumed) == (3 if moment == "part" else 1)
 
 

@@ -1,13 +1,4 @@
-"""The result folder of a run: names that are checked first, and sets of files that are whole.
-
-::
-
-    group of frames --write--> .RUN.part/ --rename--> .RUN.done/ --move--> the folder
-
-A group of frames that were solved together is written into a hidden folder, which gets another name
-when it is complete: until then nothing has happened to the results, from then on all of it will,
-even if the program is killed, since the next run goes on where it stopped.
-"""
+"""The result folder of a run: names that are checked first, and sets of files that are whole."""
 
 import json
 import os
@@ -21,22 +12,15 @@ from pathlib import Path
 from astropy.table import Table
 
 from wpdc_gwcs.calibration.manifest import file_of, read_manifest
+from wpdc_gwcs.calibration.staging import FRAME_SUFFIXES, REMOVED, clean, lock, put_in_place
 from wpdc_gwcs.calibration.summary import summarize
 from wpdc_gwcs.exceptions import InputError
 
-try:
-    import fcntl
-except ImportError:  # a system without locks of this kind
-    fcntl = None
+__all__ = ["ERRORS", "Outcome", "ResultFolder", "file_stem", "superseded_name"]
 
-__all__ = ["ERRORS", "FRAME_SUFFIXES", "Outcome", "ResultFolder", "file_stem", "superseded_name"]
-
-#: Files of a frame, in the order in which they get their names.
-FRAME_SUFFIXES = (".sources.ecsv", ".matches.ecsv", ".wcs.asdf")
 #: Where the details of internal errors are.
 ERRORS = "errors.log"
 _SUMMARY, _MANIFEST = "summary.ecsv", "manifest.json"
-_REMOVED = "removed.json"
 
 
 def file_stem(name):
@@ -136,24 +120,14 @@ class ResultFolder:
             raise InputError(
                 f"{self.folder}: the output folder must be writable: {reason}"
             ) from err
-        self._lock = _lock(self.folder)
-        self._clean()
+        self._lock = lock(self.folder)
+        clean(self.folder)
         return self
 
     def __exit__(self, *_):
-        self._clean()
+        clean(self.folder)
         if self._lock is not None:
             os.close(self._lock)
-
-    def _clean(self):
-        """Complete what has begun to get its names, and remove what has not."""
-        for done in sorted(self.folder.glob(".*.done")):
-            _move(done, self.folder)
-        for part in self.folder.glob(".*.part*"):
-            if part.is_dir():
-                shutil.rmtree(part, ignore_errors=True)
-            else:
-                part.unlink(missing_ok=True)
 
     def check(self, groups):
         """Check all names before the work.
@@ -375,14 +349,14 @@ class ResultFolder:
             manifest = self._manifest.with_states(states)
             self._write_state(part, manifest, rows)
             for path in part.iterdir():
-                if path.name != _REMOVED:
+                if path.name != REMOVED:
                     self.require_free(path.name)
             part.rename(part.with_suffix(".done"))
         except OSError as err:
             raise InputError(f"{self.folder}: cannot be written to: {err.strerror or err}") from err
         self._manifest, self._rows = manifest, rows
         self._mine |= {path.name for path in part.with_suffix(".done").iterdir()}
-        _move(part.with_suffix(".done"), self.folder)
+        put_in_place(part.with_suffix(".done"), self.folder)
 
     def _write_into(self, part, group, outcome):
         """Write results into a folder: the files of each frame, and those that they share."""
@@ -418,7 +392,7 @@ class ResultFolder:
             for suffix in FRAME_SUFFIXES
             if frame.name + suffix not in files[frame.name]
         ]
-        (part / _REMOVED).write_text(json.dumps(removed), encoding="utf-8")
+        (part / REMOVED).write_text(json.dumps(removed), encoding="utf-8")
         return files, list(shared)
 
     def _write_state(self, part, manifest, rows):
@@ -492,47 +466,6 @@ def _of_run(result, run):
         marked.meta["run"] = run
         return marked
     return replace(result, provenance={**result.provenance, "run": run})
-
-
-def _move(done, folder):
-    """Give finished files their names, the WCS of a frame after its tables; can be done again."""
-    try:
-        removed = json.loads((done / _REMOVED).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        removed = []
-    for name in removed:
-        (folder / name).unlink(missing_ok=True)
-    # By frame, so that its files come as one as nearly as can be.
-    for name in sorted(os.listdir(done), key=_order):
-        if name != _REMOVED:
-            os.replace(done / name, folder / name)
-    shutil.rmtree(done)
-
-
-def _order(name):
-    for k, suffix in enumerate(FRAME_SUFFIXES):
-        if name.endswith(suffix):
-            return 0, name.removesuffix(suffix), k
-    return (2 if name in (_SUMMARY, _MANIFEST) else 1), name, 0
-
-
-def _lock(folder):
-    """Lock a folder, which ends with this process whatever ends it; `None` where there are none."""
-    if fcntl is None:
-        return None
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise InputError(
-            f"{folder}: another run is writing into this folder: wait, or choose another one"
-        ) from None
-    except OSError:
-        # A file system without locks.
-        os.close(descriptor)
-        return None
-    return descriptor
 
 
 def _read_rows(path, run):
