@@ -389,6 +389,10 @@ def test_names_are_checked_before_the_work(frames, inputs, tmp_path, monkeypatch
     source = tmp_path / "out" / "summary.ecsv"
     source.write_text("")
     refused("summary.ecsv: is an input", [replace(frames[0], source=str(source))], overwrite=True)
+    catalog = tmp_path / "out" / "one.solution.asdf"
+    Table.read(inputs[1]).write(catalog, format="fits")
+    with pytest.raises(InputError, match="one.solution.asdf: is an input"):
+        calibrate(frames, catalog, output=tmp_path / "out", overwrite=True)
 
 
 def test_damaged_manifest(frames, inputs, tmp_path):

@@ -277,7 +277,10 @@ def frame_sum(frame):
         if f.name != "wcs" and not callable(getattr(frame, f.name))
     }
     text = json.dumps([plain, state["size"], state["modified"]], sort_keys=True, default=repr)
-    sky = np.array(sky_of(frame.wcs, x.ravel(), y.ravel()))
+    try:
+        sky = np.array(sky_of(frame.wcs, x.ravel(), y.ravel()))
+    except Exception:  # noqa: BLE001  A WCS that cannot be used is the failure of its frame, later.
+        return None
     return hashlib.sha256(text.encode("utf-8", "surrogatepass") + sky.tobytes()).hexdigest()
 
 

@@ -108,6 +108,7 @@ class ResultFolder:
         self._mine = set()  # files that may be replaced
         self._rows = {}
         self._names = {}  # first frame of a group to the files that the group may write
+        self._inputs = set()
         self._lock = None
 
     def __enter__(self):
@@ -129,13 +130,15 @@ class ResultFolder:
         if self._lock is not None:
             os.close(self._lock)
 
-    def check(self, groups):
+    def check(self, groups, *, inputs=()):
         """Check all names before the work.
 
         Parameters
         ----------
         groups : list of list of Frame
             Frames that are solved together.
+        inputs : list of Path, optional
+            Files besides those of the frames that are never replaced.
 
         Raises
         ------
@@ -147,14 +150,15 @@ class ResultFolder:
         for group in groups:
             self._names[group[0].name] = _names_of(group, cameras)
         _check_distinct(self._names.values())
+        files = [*inputs, *(file for group in groups for file in map(file_of, group) if file)]
+        self._inputs = {Path(file).resolve() for file in files}
         if not self._resume:
             self._check_free(groups)
 
     def _check_free(self, groups):
-        inputs = {file.resolve() for group in groups for file in map(file_of, group) if file}
         names = [n for g in groups if not self.is_done(g) for n in self._names[g[0].name]]
         for name in [*names, _SUMMARY, _MANIFEST]:
-            self.require_free(name, inputs=inputs)
+            self._require_free(name)
 
     def begin(self, groups, plan):
         """Begin a run, or go on with one.
@@ -184,21 +188,8 @@ class ResultFolder:
             self._check_free(groups)
         return self._manifest
 
-    def require_free(self, name, *, inputs=()):
-        """Refuse to go on if a file is there and may not be replaced.
-
-        Parameters
-        ----------
-        name : str
-            Name of the file in the folder.
-        inputs : set of Path, optional
-            Files that are never replaced.
-
-        Raises
-        ------
-        InputError
-            If so.
-        """
+    def _require_free(self, name):
+        """Refuse to go on if a file of the folder is there and may not be replaced."""
         path = self.folder / name
         try:
             mode = path.stat().st_mode
@@ -210,7 +201,7 @@ class ResultFolder:
         if not stat.S_ISREG(mode):
             what = "a folder" if stat.S_ISDIR(mode) else "no file"
             raise InputError(f"{path}: is {what}, and a file of this name would be written")
-        if path.resolve() in inputs:
+        if path.resolve() in self._inputs:
             raise InputError(f"{path}: is an input, and a file of this name would be written")
         if not (self._overwrite or name in self._mine):
             raise InputError(f"{path}: file exists, and is replaced only with --overwrite")
@@ -350,7 +341,7 @@ class ResultFolder:
             self._write_state(part, manifest, rows)
             for path in part.iterdir():
                 if path.name != REMOVED:
-                    self.require_free(path.name)
+                    self._require_free(path.name)
             part.rename(part.with_suffix(".done"))
         except OSError as err:
             raise InputError(f"{self.folder}: cannot be written to: {err.strerror or err}") from err

@@ -22,7 +22,7 @@ from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.summary import summarize, summary_row
 from wpdc_gwcs.calibration.workers import Task, Workers, internal_error, stored_of
 from wpdc_gwcs.camera import build_camera
-from wpdc_gwcs.catalogs import fill_motions, read_catalog
+from wpdc_gwcs.catalogs import fill_motions, read_catalog, split_extension
 from wpdc_gwcs.exceptions import DuplicateFrameError, FitError, InternalError, MatchError, WPDCError
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.threads import one_blas_thread
@@ -153,7 +153,7 @@ def calibrate(
         path = catalog if isinstance(catalog, str | os.PathLike) else None
         # Before the catalogue, which may take a while.
         if folder is not None:
-            folder.check(groups)
+            folder.check(groups, inputs=[] if path is None else [split_extension(path)[0]])
         catalog = read_catalog(catalog)
         run_id = uuid.uuid4().hex[:12]
         if folder is not None:
@@ -168,7 +168,7 @@ def calibrate(
             )
             run_id = folder.begin(groups, plan).run
         # Once and from the whole catalogue: a star moves alike in all frames.
-        run = _Run(fill_motions(catalog), solution, settings, update, progress, len(frames))
+        run = _Run(frames, fill_motions(catalog), solution, settings, update, progress)
         done = [group for group in groups if folder is not None and folder.is_done(group)]
         outcomes = {group[0].name: folder.load(group) for group in done}
         todo = [group for group in groups if group[0].name not in outcomes]
@@ -204,12 +204,12 @@ def _as_frames(frames):
 class _Run:
     """What all frames of a run share."""
 
+    frames: list
     catalog: Table
     solution: object
     settings: Settings
     update: bool
     progress: Callable
-    n_frames: int
 
     @property
     def common(self):
@@ -219,15 +219,17 @@ class _Run:
 
 def _outcomes(groups, run, workers):
     """Yield what is found of each group; those behind it are matched in the meantime."""
-    other = _of_other_detectors([f for group in groups for f in group], run.solution)
+    other = _of_other_detectors(run.frames, run.solution)
     submitted = [{} if other else _submit(group, run, workers, narrow=True) for group in groups]
-    counter = itertools.count(1)
-    run.progress("match", 0, run.n_frames)
-    for k, (group, tasks) in enumerate(zip(groups, submitted, strict=True)):
+    counter, n_frames = itertools.count(1), sum(map(len, groups))
+    run.progress("match", 0, n_frames)
+    for k, group in enumerate(groups):
+        # Taken away, so that what is done needs no memory any more.
+        tasks, submitted[k] = submitted[k], None
         results = {frame.name: other[frame.name] for frame in group} if other else {}
-        for name, outcome in tasks.items():
-            results[name] = outcome()
-            run.progress("match", next(counter), run.n_frames)
+        for name in list(tasks):
+            results[name] = tasks.pop(name)()
+            run.progress("match", next(counter), n_frames)
         run.progress("solve", k, len(groups))
         try:
             if not other:

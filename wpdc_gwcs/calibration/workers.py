@@ -167,10 +167,11 @@ class Workers:
         self._mine = threading.local()
         self._processes = set()
         self._closed = False
-        self._futures = []
+        self._futures = set()
         if executor is None and jobs > 1:
-            # Else the first process that is started starts it, and hears Ctrl-C again thereafter.
-            resource_tracker.ensure_running()
+            if hasattr(signal, "pthread_sigmask"):
+                # Else the first process to be started starts it, and hears Ctrl-C thereafter.
+                resource_tracker.ensure_running()
             self._threads = ThreadPoolExecutor(jobs, initializer=_ignore_interrupts)
 
     def __enter__(self):
@@ -207,8 +208,23 @@ class Workers:
                 return partial(FailedFrame, internal_error(problem), 0, 0.0)
         else:
             return partial(match_or_fail, task)
-        self._futures.append(future)
-        return partial(_outcome, future, warned=self._threads is not None)
+        self._futures.add(future)
+        return partial(self._outcome, future)
+
+    def _outcome(self, future):
+        try:
+            answer = future.result()
+        except Exception as problem:  # noqa: BLE001  Such as the death of a worker of an executor.
+            return FailedFrame(internal_error(problem), 0, 0.0)
+        finally:
+            # It would keep what is asked for once.
+            self._futures.discard(future)
+        if self._threads is None:
+            return answer
+        result, messages = answer
+        for message in messages:
+            warnings.warn(message)
+        return result
 
     def _in_process(self, task):
         """Done by a thread: hand the task to its process, a new one where that has died."""
@@ -241,20 +257,6 @@ class Workers:
             "(-9: killed, mostly for want of memory)"
         )
         return FailedFrame(failure, 0, 0.0), []
-
-
-def _outcome(future, *, warned):
-    try:
-        if not warned:
-            return future.result()
-        result, messages = future.result()
-        for message in messages:
-            warnings.warn(message)
-        return result
-    except Warning:
-        raise
-    except Exception as problem:  # noqa: BLE001  Such as the death of a worker of an executor.
-        return FailedFrame(internal_error(problem), 0, 0.0)
 
 
 def _ignore_interrupts():
