@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import pytest
 from astropy.table import Table, vstack
 
 from wpdc_gwcs import Settings, calibrate, read
+from wpdc_gwcs.calibration import match_frame
 from wpdc_gwcs.calibration import results as results_module
 from wpdc_gwcs.calibration import run as run_module
 from wpdc_gwcs.calibration.manifest import read_manifest
@@ -105,6 +107,19 @@ def test_python_and_command_line_write_the_same(frames, inputs, tmp_path):
     assert numbers_of(tmp_path / "python") == numbers_of(tmp_path / "shell")
     names = [sorted(p.name for p in (tmp_path / n).iterdir()) for n in ("python", "shell")]
     assert names[0] == names[1]
+
+
+def test_tables_of_another_run_are_not_evaluated(frames, inputs, tmp_path, capsys):
+    calibrate(frames[:1], inputs[1], output=tmp_path)
+    path = tmp_path / f"{frames[0].name}.matches.ecsv"
+    path.write_text(re.sub(r"run: \w+", "run: another", path.read_text()))
+    assert command(["evaluate", str(tmp_path)]) == 2
+    assert "must be of the same run as" in capsys.readouterr().err
+
+
+def test_one_frame_takes_any_catalogue(frames, inputs):
+    matched = [match_frame(frames[0], c) for c in (inputs[1], Table.read(inputs[1]))]
+    np.testing.assert_array_equal(*(m.reference["catalog_index"] for m in matched))
 
 
 class Stopped(BaseException):

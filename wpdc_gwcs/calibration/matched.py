@@ -15,7 +15,7 @@ from wpdc_gwcs.calibration.start import (
     linear_wcs,
     sky_of,
 )
-from wpdc_gwcs.catalogs import fill_motions, propagate, select_cone
+from wpdc_gwcs.catalogs import fill_motions, propagate, read_catalog, select_cone
 from wpdc_gwcs.centroids import build_epsf, fit_centroids, subtract_stars
 from wpdc_gwcs.detection import detect_companions, detect_sources, subtract_background
 from wpdc_gwcs.exceptions import DetectionError, MatchError, WPDCError
@@ -179,8 +179,8 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     ----------
     frame : Frame
         Image or source list.
-    catalog : `~astropy.table.Table`
-        Reference catalogue as returned by `read_catalog`.
+    catalog : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
+        Reference catalogue: what `read_catalog` takes, or has returned.
     settings : Settings, optional
         Choices; the defaults work for any camera.
     sources : `~astropy.table.Table`, optional
@@ -200,6 +200,8 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     """
     settings = Settings() if settings is None else settings
     began = time.perf_counter()
+    if "catalog_index" not in getattr(catalog, "colnames", ()):
+        catalog = read_catalog(catalog)
     if sources is None:
         sources = measure_sources(frame, settings)
     sources = with_errors(sources)
