@@ -206,6 +206,8 @@ def calibrate_command(
         raise InputError("--update needs the stored solution: --solution FILE")
     if no_camera and exposure_key is not None:
         raise InputError("--exposure-key ties detectors together, --no-camera keeps them apart")
+    if detector is not None and not (detector.strip() and detector.isprintable()):
+        raise InputError(f"--detector must be a name that can be printed, got {detector!r}")
     if not 0 < scheduler_timeout < float("inf"):
         raise InputError(f"--scheduler-timeout must be positive seconds, got {scheduler_timeout}")
     if jobs < 1:
