@@ -693,6 +693,15 @@ def test_a_flipped_bit_is_found_or_changes_nothing(tmp_path, calibration, rng):
         assert found > 10
 
 
+def test_a_table_that_astropy_leaves_out_is_missed(tmp_path, calibration):
+    write(calibration, tmp_path / "a.fits")
+    data = (tmp_path / "a.fits").read_bytes()
+    at = data.index(b"NAXIS1", data.index(b"XTENSION", data.index(b"XTENSION") + 80))
+    (tmp_path / "b.fits").write_bytes(data[: at + 31] + bytes(129) + data[at + 160 :])
+    with pytest.raises(FileFormatError, match=r"b.fits: damaged FITS file: HDU 2 cannot be read"):
+        read(tmp_path / "b.fits")
+
+
 def test_a_number_that_still_reads_as_one_is_found(tmp_path, calibration):
     write(calibration, tmp_path / "a.asdf")
     data = (tmp_path / "a.asdf").read_bytes()

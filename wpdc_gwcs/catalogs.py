@@ -157,8 +157,12 @@ _READ_ERRORS = (
     LookupError,
     AttributeError,
     ImportError,
+    RuntimeError,
+    ArithmeticError,
+    AssertionError,
     ExpatError,
     IORegistryError,
+    fits.VerifyError,
 )
 
 

@@ -42,6 +42,7 @@ READ_ERRORS = (
     AttributeError,
     RuntimeError,
     ArithmeticError,
+    AssertionError,
     lzma.LZMAError,
     zlib.error,
     fits.VerifyError,
@@ -213,16 +214,25 @@ def open_fits(path, *, error=FileFormatError, lazy=False):
     calibration; so do not warn of one's own inside the block.
     """
     path = Path(path)
-    _check_once(path, error)
-    with warnings.catch_warnings():
+    number = _check_once(path, error)
+    # Open, so that it is closed whatever astropy makes of it, and '~' is a name like any other.
+    with warnings.catch_warnings(), open(path, "rb") as stream:
         warnings.simplefilter("ignore")
         try:
-            # Absolute, since a leading '~' is not a name to astropy.
-            hdus = fits.open(path.absolute(), memmap=False, lazy_load_hdus=lazy)
+            hdus = fits.open(stream, memmap=False, lazy_load_hdus=lazy)
         except READ_ERRORS as problem:
             raise error(f"{path}: damaged FITS file: {first_line(problem)}") from problem
         with hdus:
-            yield hdus
+            if not lazy and len(hdus) < number:
+                # astropy leaves out what it cannot read, and all behind it.
+                raise error(f"{path}: damaged FITS file: HDU {len(hdus)} cannot be read")
+            try:
+                yield hdus
+            except InputError:
+                raise
+            except READ_ERRORS as problem:
+                # Much of a header is read only when it is asked for.
+                raise error(f"{path}: damaged FITS file: {first_line(problem)}") from problem
 
 
 # Files that were found complete, as they were then: each frame of a mosaic opens its file anew.
@@ -235,9 +245,9 @@ def _check_once(path, error):
     except OSError:
         state = None
     seen = state and (state.st_size, state.st_mtime_ns)
-    if seen is None or _complete.get(path) != seen:
-        check_complete(path, error=error)
-        _complete[path] = seen
+    if seen is None or _complete.get(path, (None,))[0] != seen:
+        _complete[path] = seen, check_complete(path, error=error)
+    return _complete[path][1]
 
 
 def check_complete(path, *, error=FileFormatError):
@@ -249,6 +259,11 @@ def check_complete(path, *, error=FileFormatError):
         FITS file, compressed as a whole or not.
     error : type, optional
         Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
+
+    Returns
+    -------
+    number : int
+        Number of HDUs.
 
     Raises
     ------
@@ -263,13 +278,14 @@ def check_complete(path, *, error=FileFormatError):
         kind = next((k for magic, k in _MAGIC if start.startswith(magic)), None)
         if kind in _OPENERS:
             with _OPENERS[kind](path, "rb") as file:
-                _walk(file, path, error, size=None)
+                number = _walk(file, path, error, size=None)
                 # The trailing checksum of the compressed stream counts too.
                 while file.read(1 << 24):
                     pass
         else:
             with open(path, "rb") as file:
-                _walk(file, path, error, size=path.stat().st_size)
+                number = _walk(file, path, error, size=path.stat().st_size)
+        return number
     except InputError:
         raise
     except READ_ERRORS as problem:
@@ -284,7 +300,7 @@ def _walk(file, path, error, size):
     while True:
         header = _read_mandatory(file, path, error, number)
         if header is None:
-            return
+            return number
         position += header.pop("length")
         bits = abs(header.get("BITPIX", 8))
         for keyword, value in header.items():
