@@ -55,8 +55,8 @@ def error_of(capsys):
 def test_calibrate_writes_what_it_promises(results, simulation):
     names = sorted(p.name for p in results.iterdir())
     assert names == [
-        "sim-01.matches.ecsv", "sim-01.wcs.asdf", "sim-02.matches.ecsv", "sim-02.wcs.asdf",
-        "sim.solution.asdf", "summary.ecsv",
+        "manifest.json", "sim-01.matches.ecsv", "sim-01.wcs.asdf", "sim-02.matches.ecsv",
+        "sim-02.wcs.asdf", "sim.solution.asdf", "summary.ecsv",
     ]  # fmt: skip
     summary = Table.read(results / "summary.ecsv")
     assert list(summary["status"]) == ["solved", "solved"]
@@ -151,6 +151,13 @@ def make_bad_files(folder, reference):
         (["{frame}", "--r0", "-5"], "r0 must be a positive number of px, got -5"),
         (["{frame}", "--n-grid", "many"], "Invalid value for '--n-grid'"),
         (["{frame}", "--holdout", "1.5"], "holdout must be between 0 and 0.9, got 1.5"),
+        (["{frame}", "--detector", "a\nb"], "--detector must be a name that can be printed"),
+        (["{frame}", "--detector", " "], "--detector must be a name that can be printed"),
+        (["{frame}", "--seed", "-1"], "seed must be an integer from 0 to .*, got -1"),
+        (["{frame}", "--threshold", "inf"], "threshold and min_snr must be finite, got inf"),
+        (["{frame}", "--scheduler-timeout", "nan"], "--scheduler-timeout must be positive"),
+        (["{frame}", "--degree", "²"], "invalid literal"),
+        (["{frame}", "--output", "/dev/null"], "/dev/null: the output folder must be writable"),
         (["{frame}", "--jobs", "0"], "--jobs must be at least 1, got 0"),
         (["{frame}", "--update"], "--update needs the stored solution"),
         (["{frame}", "--no-such-option"], "No such option"),

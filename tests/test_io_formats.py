@@ -18,7 +18,8 @@ from numpy.polynomial import polynomial
 from wpdc_gwcs import build_wcs
 from wpdc_gwcs.exceptions import FileFormatError, InputError, WPDCWarning
 from wpdc_gwcs.io import OutputExistsError, read, read_wcs, write
-from wpdc_gwcs.io.asdf import FORMAT_VERSION
+from wpdc_gwcs.io.asdf import _loaded
+from wpdc_gwcs.io.integrity import FORMAT_VERSION, content_sum
 from wpdc_gwcs.lookup import ResidualMap
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 from wpdc_gwcs.solution import Calibration, DistortionSolution
@@ -73,7 +74,7 @@ def make_calibration(
     return Calibration(
         frame="e00",
         solution=solution,
-        crval=np.array(crval) + 0.001,
+        crval=np.minimum(np.array(crval) + 0.001, [360.0, 90.0]),
         cd=turn @ cd,
         field=LookupTable(np.linspace(x[0], x[-1], 4), y[::4], *rng.normal(size=(2, 4, 4)) * 0.01)
         if field
@@ -189,9 +190,12 @@ def test_stock_wcs_in_the_file(tmp_path, table):
 
 
 def edited(path, tmp_path, edit):
+    """A file with other values, and a sum that agrees with them."""
     with asdf.open(path, lazy_load=False, memmap=False) as file:
-        tree = file.tree["wpdc"]
+        tree = _loaded(file.tree["wpdc"])
+        del tree["content_sum"]
         edit(tree)
+        tree["content_sum"] = content_sum(tree)
         asdf.AsdfFile({"wpdc": tree}).write_to(tmp_path / "edited.asdf")
     return tmp_path / "edited.asdf"
 
@@ -199,12 +203,15 @@ def edited(path, tmp_path, edit):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("format_version", "1.2.0", "must not be newer than 1.1.0, got 1.2.0"),
-        ("format_version", "2.0.0", "must not be newer than 1.1.0, got 2.0.0"),
-        ("format_version", "new", "must be like '1.1.0', got 'new'"),
+        ("format_version", "2.0.0", "must not be newer than 1.x, got 2.0.0"),
+        ("format_version", "new", "must be like 1.2.0, got 'new'"),
         ("kind", "map", "must be 'solution', 'calibration' or 'camera', got 'map'"),
-        ("cd", [[1.0, 2.0]], r"cd must be finite and of the shape \(2, 2\)"),
+        ("cd", [[1.0, 2.0]], r"cd must have the shape \(2, 2\)"),
+        ("cd", [[1e-4, 2e-4], [2e-4, 4e-4]], "cd must have an inverse"),
+        ("cd", "none", "damaged 'wpdc' tree"),
         ("crval", [1.0, float("nan")], "crval must be finite"),
+        ("crval", [1.0, 91.0], "crval must be RA and Dec"),
+        ("sigma", [[1.0]], r"sigma must have the shape \(3, None, None\)"),
         ("solution", None, "damaged 'wpdc' tree"),
     ],
 )
@@ -215,7 +222,7 @@ def test_bad_trees(tmp_path, calibration, key, value, message):
         read(path)
 
 
-@pytest.mark.parametrize("key", ["frame", "crval", "solution", "format_version"])
+@pytest.mark.parametrize("key", ["frame", "crval", "solution"])
 def test_missing_entries(tmp_path, calibration, key):
     write(calibration, tmp_path / "a.asdf")
     path = edited(tmp_path / "a.asdf", tmp_path, lambda tree: tree.pop(key))
@@ -279,7 +286,9 @@ def test_fits_from_the_keywords_alone(tmp_path, calibration):
     """What another writer of the keywords would give: the attitude is in the polynomial."""
     write(calibration, tmp_path / "a.fits")
     with fits.open(tmp_path / "a.fits") as hdus:
-        fits.HDUList([h for h in hdus if h.name != "WPDC_INSTRUMENT"]).writeto(tmp_path / "b.fits")
+        fits.HDUList([h for h in hdus if h.name != "WPDC_INSTRUMENT"]).writeto(
+            tmp_path / "b.fits", checksum=True
+        )
     back = read(tmp_path / "b.fits")
     assert distance(calibration, back.wcs(*grid(calibration))) < 1e-9
     np.testing.assert_array_equal(back.cd, back.solution.cd)
@@ -287,7 +296,7 @@ def test_fits_from_the_keywords_alone(tmp_path, calibration):
     # Edited keywords count, not what the table of the instrument still says.
     with fits.open(tmp_path / "a.fits") as hdus:
         hdus[0].header["PV1_0"] += 1e-4
-        hdus.writeto(tmp_path / "c.fits")
+        hdus.writeto(tmp_path / "c.fits", checksum=True)
     assert distance(calibration, read(tmp_path / "c.fits").wcs(*grid(calibration))) > 1.0
 
 
@@ -500,7 +509,7 @@ def spoiled_fits(tmp_path, calibration, edit):
     write(calibration, tmp_path / "a.fits", overwrite=True)
     with fits.open(tmp_path / "a.fits") as hdus:
         edit(hdus)
-        hdus.writeto(tmp_path / "b.fits", overwrite=True)
+        hdus.writeto(tmp_path / "b.fits", overwrite=True, checksum=True)
     return tmp_path / "b.fits"
 
 
@@ -543,9 +552,9 @@ class TestBadFits:
 
     def test_newer_version(self, tmp_path, calibration):
         def edit(hdus):
-            hdus[0].header["WPDCVERS"] = "1.1"
+            hdus[0].header["WPDCVERS"] = "2.0"
 
-        with pytest.raises(FileFormatError, match="must not be newer than 1.0, got 1.1"):
+        with pytest.raises(FileFormatError, match="must not be newer than 1.x, got 2.0"):
             read(spoiled_fits(tmp_path, calibration, edit))
 
     @pytest.mark.parametrize("part", [0.01, 0.2, 0.7, 0.9])
@@ -630,9 +639,11 @@ def test_nothing_is_left_of_a_write_that_fails(tmp_path, calibration, monkeypatc
     (tmp_path / "a.out").write_text("precious")
     target = {"asdf": "asdf.AsdfFile.write_to", "fits": "astropy.io.fits.HDUList.writeto"}[format]
 
-    def half(self, path, **options):
-        with open(path, "wb") as file:
-            file.write(b"half")
+    def half(self, target, **options):
+        if hasattr(target, "write"):
+            target.write(b"half")
+        else:
+            target.write_bytes(b"half")
         raise error
 
     monkeypatch.setattr(target, half)
@@ -641,6 +652,107 @@ def test_nothing_is_left_of_a_write_that_fails(tmp_path, calibration, monkeypatc
         write(calibration, tmp_path / "a.out", format=format, overwrite=True)
     assert os.listdir(tmp_path) == ["a.out"]
     assert (tmp_path / "a.out").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    "name", ["run#2", "a?b", "a;b", "a%41", "a\tb", "a\nb", "~", " ", "é", "*"]
+)
+@pytest.mark.parametrize("format", ["asdf", "fits", "cpdis", "head", "sip", "stock"])
+def test_names_are_names_and_nothing_else(tmp_path, calibration, format, name, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for other in ("run", "a", "aA"):
+        (tmp_path / other).write_text("precious")
+    before = set(os.listdir(tmp_path))
+    for path in (f"{name}.out", os.path.join(name, "a.out")):
+        os.makedirs(os.path.join(".", name), exist_ok=True)
+        write(calibration, path, format=format)
+        if format in ("asdf", "fits"):
+            np.testing.assert_array_equal(read(path).cd, calibration.cd)
+    assert set(os.listdir(tmp_path)) == before | {name, f"{name}.out"}
+    assert os.listdir(tmp_path / name) == ["a.out"]
+    assert all((tmp_path / other).read_text() == "precious" for other in ("run", "a", "aA"))
+
+
+def test_a_flipped_bit_is_found_or_changes_nothing(tmp_path, calibration, rng):
+    x, y = grid(calibration, n=9)
+    for name in ("a.asdf", "a.fits"):
+        write(calibration, tmp_path / name)
+        data = (tmp_path / name).read_bytes()
+        truth = read(tmp_path / name).wcs(x, y)
+        found = 0
+        for bit in rng.integers(8 * len(data), size=40):
+            bad = bytearray(data)
+            bad[bit // 8] ^= 1 << (bit % 8)
+            (tmp_path / "b").write_bytes(bad)
+            try:
+                same = read(tmp_path / "b").wcs(x, y)
+            except InputError:
+                found += 1
+            else:
+                np.testing.assert_array_equal(same, truth)
+        assert found > 10
+
+
+def test_a_table_that_astropy_leaves_out_is_missed(tmp_path, calibration):
+    write(calibration, tmp_path / "a.fits")
+    data = (tmp_path / "a.fits").read_bytes()
+    at = data.index(b"NAXIS1", data.index(b"XTENSION", data.index(b"XTENSION") + 80))
+    (tmp_path / "b.fits").write_bytes(data[: at + 31] + bytes(129) + data[at + 160 :])
+    with pytest.raises(FileFormatError, match=r"b.fits: damaged FITS file: HDU 2 cannot be read"):
+        read(tmp_path / "b.fits")
+
+
+def test_a_number_that_still_reads_as_one_is_found(tmp_path, calibration):
+    write(calibration, tmp_path / "a.asdf")
+    data = (tmp_path / "a.asdf").read_bytes()
+    for old, new in [(b"294.6", b"294.5"), (b"lookup_table", b"lookup_tabel")]:
+        assert old in data
+        (tmp_path / "b.asdf").write_bytes(data.replace(old, new))
+        with pytest.raises(FileFormatError, match="do not agree with their 'content_sum'"):
+            read(tmp_path / "b.asdf")
+
+
+def test_a_later_minor_version_opens(tmp_path, calibration):
+    def later(tree):
+        tree |= {"format_version": "1.99.0", "news": [1, 2]}
+
+    write(calibration, tmp_path / "a.asdf")
+    back = read(edited(tmp_path / "a.asdf", tmp_path, later))
+    np.testing.assert_array_equal(back.cd, calibration.cd)
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 12)),
+        "a: &a [*a]\n",
+        "a: [" + "0, " * 3_000_000 + "0]\n",
+        "a: " + "[" * 5000 + "]" * 5000 + "\n",
+        "- " * 5000 + "a\n",
+        "a: [1, 2\n",
+        "a: \x07\n",
+    ],
+    ids=["aliases", "itself", "long", "deep", "deep block", "open", "control character"],
+)
+def test_trees_that_stand_for_too_much(tmp_path, tree):
+    head = "#ASDF 1.0.0\n#ASDF_STANDARD 1.6.0\n%YAML 1.1\n--- \n"
+    first = "a0: &a0 [x]\n" if "a1:" in tree else ""
+    (tmp_path / "a.asdf").write_text(f"{head}{first}{tree}...\n")
+    with pytest.raises(FileFormatError, match=r"a.asdf: "):
+        read(tmp_path / "a.asdf")
+
+
+def test_blocks_that_stand_for_too_much(tmp_path):
+    """A petabyte, compressed."""
+    asdf.AsdfFile({"wpdc": np.zeros(1000)}).write_to(
+        tmp_path / "a.asdf", all_array_compression="zlib"
+    )
+    data = bytearray((tmp_path / "a.asdf").read_bytes())
+    at = data.index(b"\xd3BLK") + 6 + 8 + 16
+    data[at : at + 8] = (1 << 50).to_bytes(8)
+    (tmp_path / "a.asdf").write_bytes(data)
+    with pytest.raises(FileFormatError, match="must hold at most 4 GB, hold 1048576.0"):
+        read(tmp_path / "a.asdf")
 
 
 def test_older_files_keep_opening():

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 
 import numpy as np
-from astropy.table import QTable
+from astropy.table import Table
 
 from wpdc_gwcs.calibration.checks import check_solution, shortcomings
 from wpdc_gwcs.calibration.matched import optional_column
@@ -33,6 +33,12 @@ log = logging.getLogger(__name__)
 _MAX_REMATCH = 3
 _SETTLED = 0.01
 _REMATCH_SIGMAS = 5.0
+
+# Columns of matches, which are plain arrays with units: residuals are computed with.
+_UNITS = {
+    **dict.fromkeys(("x", "y", "x_err", "y_err", "dx", "dy"), "pix"),
+    **dict.fromkeys(("ra", "dec"), "deg"),
+}
 
 
 def cameras_of(frames):
@@ -405,7 +411,7 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
     src, ref = frame.sources[i_src], frame.reference[i_ref]
     catalog_index = np.asarray(ref["catalog_index"])
     held = np.zeros(len(src), bool) if holdout is None else holdout[catalog_index]
-    matches = QTable(
+    matches = Table(
         {
             "source_index": i_src.astype(np.int64),
             "catalog_index": catalog_index.astype(np.int64),
@@ -421,10 +427,13 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
             "holdout": held,
         }
     )
+    for name in matches.colnames:
+        matches[name].unit = _UNITS.get(name)
     # Not of use here, but to see whether residuals depend on them.
     for table, name in ((src, "snr"), (ref, "phot_g_mean_mag"), (ref, "bp_rp")):
         if name in table.colnames:
             matches[name] = optional_column(table, name)
+            matches[name].unit = table[name].unit
     residuals = evaluate(fit.dx[fit.used], fit.dy[fit.used])
     scale = np.sqrt(abs(np.linalg.det(fit.cd))) * 3.6e6
     statistics = {

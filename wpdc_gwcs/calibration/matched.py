@@ -16,7 +16,7 @@ from wpdc_gwcs.calibration.start import (
     linear_wcs,
     sky_of,
 )
-from wpdc_gwcs.catalogs import fill_motions, propagate, select_cone
+from wpdc_gwcs.catalogs import fill_motions, propagate, read_catalog, select_cone
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
 from wpdc_gwcs.selection import left_out
@@ -24,6 +24,7 @@ from wpdc_gwcs.selection import left_out
 __all__ = [
     "FailedFrame",
     "MatchedFrame",
+    "catalog_of_frame",
     "match_frame",
     "optional_column",
     "reference_in_reach",
@@ -34,6 +35,9 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 _ERROR_FLOOR = 0.01  # px
+
+# Scales of the two axes of a header that differ by more are no scales.
+_MOST_CONDITION = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +84,8 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     ----------
     frame : Frame
         Image or source list.
-    catalog : `~astropy.table.Table`
-        Reference catalogue as returned by `read_catalog`.
+    catalog : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
+        Reference catalogue: what `read_catalog` takes, or has returned.
     settings : Settings, optional
         Choices; the defaults work for any camera.
     sources : `~astropy.table.Table`, optional
@@ -101,16 +105,17 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     """
     settings = Settings() if settings is None else settings
     began = time.perf_counter()
+    if "catalog_index" not in getattr(catalog, "colnames", ()):
+        catalog = read_catalog(catalog)
     if sources is None:
         sources = measure_sources(frame, settings)
     sources = with_errors(sources)
     usable = usable_sources(sources, frame, settings)
     x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)
+    start = _start(frame, solution)
     if solution is None:
-        start = linear_wcs(frame.wcs, header_reference_point(frame))
         xs, ys = start.pixels(*sky_of(frame.wcs, x, y))
     else:
-        start = linear_wcs(frame.wcs, solution.crpix)
         xs, ys = solution.undistort(x, y)
     reference = reference_in_reach(frame, catalog, start, settings)
     xr, yr = start.pixels(np.asarray(reference["ra"]), np.asarray(reference["dec"]))
@@ -213,6 +218,50 @@ def usable_sources(sources, frame, settings):
     return ~np.any(list(rules_of(sources, frame, settings).values()), axis=0)
 
 
+def _start(frame, solution):
+    """Linear WCS about which a frame is matched."""
+    point = header_reference_point(frame) if solution is None else solution.crpix
+    start = linear_wcs(frame.wcs, point)
+    if not np.linalg.cond(start.cd) < _MOST_CONDITION:
+        raise MatchError(
+            f"{frame.source}: the starting WCS must be invertible, its matrix is "
+            f"{start.cd.tolist()} deg / px at pixel {point.tolist()}"
+        )
+    return start
+
+
+def _reach(frame, start, settings):
+    """Center and radius, deg, of the sky in which a match of the frame is sought."""
+    ny, nx = frame.image_shape
+    center = detector_center(frame.image_shape)
+    ra, dec = (float(c) for c in np.ravel(sky_of(frame.wcs, *center[:, None])))
+    # As wide as the match searches, see `match_planes`.
+    margin = max(nx, ny) * (0.5 if settings.blind else 0.2) + 500
+    return ra, dec, (np.hypot(nx, ny) / 2 + margin) * start.scale
+
+
+def catalog_of_frame(frame, catalog, settings, *, solution=None):
+    """Cut the reference catalogue to what a frame can need, to be handed to another process.
+
+    Parameters
+    ----------
+    frame : Frame
+        Its WCS tells where.
+    catalog : `~astropy.table.Table`
+        Reference catalogue whose motions have been filled.
+    settings : Settings
+        A blind search needs more.
+    solution : DistortionSolution, optional
+        Stored solution of the detector.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        Rows of the catalogue, from which `match_frame` selects the same stars as from all.
+    """
+    return select_cone(catalog, *_reach(frame, _start(frame, solution), settings))
+
+
 def reference_in_reach(frame, catalog, start, settings):
     """Select the reference stars that the frame can show, at its epoch.
 
@@ -237,12 +286,7 @@ def reference_in_reach(frame, catalog, start, settings):
     MatchError
         If there are none.
     """
-    ny, nx = frame.image_shape
-    center = detector_center(frame.image_shape)
-    ra, dec = (float(c) for c in np.ravel(sky_of(frame.wcs, *center[:, None])))
-    # As wide as the match searches, see `match_planes`.
-    margin = max(nx, ny) * (0.5 if settings.blind else 0.2) + 500
-    radius = (np.hypot(nx, ny) / 2 + margin) * start.scale
+    ra, dec, radius = _reach(frame, start, settings)
     # Before the cut, which would take neighbours away; in a run it has been done for all frames.
     near = select_cone(fill_motions(catalog), ra, dec, radius)
     if settings.max_mag is not None and "phot_g_mean_mag" in near.colnames:

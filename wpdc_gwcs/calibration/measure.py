@@ -21,6 +21,9 @@ __all__ = ["measure_sources", "quality_of", "rules_of"]
 
 log = logging.getLogger(__name__)
 
+# Images smaller than this, px, have no background, and no stars on it.
+_SMALLEST = 8
+
 # Rounds after which close pairs have shared out their light.
 _PASSES_OF_PAIRS = 6
 
@@ -82,6 +85,11 @@ def measure_sources(frame, settings=None):
     if settings.centroids == "given":
         raise DetectionError(
             f"{frame.source}: centroids 'given' needs a source list, and this is an image"
+        )
+    if min(frame.image_shape) < _SMALLEST:
+        raise DetectionError(
+            f"{frame.source}: the image must be at least {_SMALLEST} x {_SMALLEST} px, is of shape "
+            f"(ny, nx) {frame.image_shape}"
         )
     image = frame.load_image()
     mask = None if frame.load_mask is None else frame.load_mask()

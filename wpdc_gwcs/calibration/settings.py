@@ -2,6 +2,9 @@
 
 import math
 from dataclasses import dataclass
+from numbers import Integral
+
+import numpy as np
 
 from wpdc_gwcs.fitting import RadialWeight
 from wpdc_gwcs.selection import MAX_ROUNDNESS, MIN_SNR
@@ -98,6 +101,12 @@ class Settings:
             raise ValueError(f"holdout must be between 0 and 0.9, got {self.holdout}")
         if not self.threshold > 0:
             raise ValueError(f"threshold must be positive, got {self.threshold}")
+        if not (isinstance(self.seed, Integral) and 0 <= self.seed < 1 << 63):
+            raise ValueError(f"seed must be an integer from 0 to 2^63 - 1, got {self.seed!r}")
+        if not (self.threshold < np.inf and self.min_snr < np.inf):
+            raise ValueError(
+                f"threshold and min_snr must be finite, got {self.threshold} and {self.min_snr}"
+            )
         if not self.min_snr >= 0:
             raise ValueError(f"min_snr must be 0 or more, got {self.min_snr}")
         if self.max_mag is not None and not math.isfinite(self.max_mag):

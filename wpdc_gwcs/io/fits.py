@@ -32,6 +32,7 @@ from wpdc_gwcs.io.files import (
     stem_of,
 )
 from wpdc_gwcs.io.headers import clean_header, find_extension, header_text
+from wpdc_gwcs.io.integrity import FORMAT_VERSION, check_sums, check_version
 from wpdc_gwcs.io.sip import fit_sip, fit_sip_inverse
 from wpdc_gwcs.io.tan import fold_attitude, parse_tan
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project
@@ -50,7 +51,6 @@ __all__ = [
 _TABLE_NAME = "WPDC_LUT"
 _INSTRUMENT_NAME = "WPDC_INSTRUMENT"
 _TABLE_COLUMNS = ("X_GRID", "Y_GRID", "DX_LUT", "DY_LUT")
-_FORMAT_VERSION = "1.0"
 _CPDIS_TOLERANCE = 5e-4  # px, aimed at; 1e-3 is promised
 _CPDIS_MOST_NODES = 1 << 22
 _SIP_DEGREES = range(2, 10)
@@ -107,6 +107,8 @@ def read_fits(path):
                 number = _only([i for i, hdu in enumerate(hdus) if "CTYPE1" in hdu.header], path)
             header = hdus[number].header.copy()
             several = len(hdus) > 1
+            if "WPDCVERS" in header:
+                check_sums(hdus, path)
             if _TABLE_NAME in hdus:
                 table = _read_table(hdus[_TABLE_NAME], f"{path}[{_TABLE_NAME}]")
             if _INSTRUMENT_NAME in hdus:
@@ -121,7 +123,7 @@ def read_fits(path):
         header = headers[number]
     version = header_text(header, "WPDCVERS")
     if version:
-        _check_version(version, path)
+        check_version(version, path)
     tan = parse_tan(header, name=name, ignore_tables=table is not None)
     if tan is None:
         raise FileFormatError(
@@ -374,20 +376,6 @@ def _only(numbers, path):
     )
 
 
-def _check_version(version, path):
-    try:
-        given = tuple(int(v) for v in version.split("."))
-    except ValueError:
-        raise FileFormatError(
-            f"{path}: card WPDCVERS must be like '{_FORMAT_VERSION}', got {version!r}"
-        ) from None
-    if given > tuple(int(v) for v in _FORMAT_VERSION.split(".")):
-        raise FileFormatError(
-            f"{path}: format version must not be newer than {_FORMAT_VERSION}, got {version}: "
-            "a newer wpdc_gwcs is needed"
-        )
-
-
 def _read_table(hdu, name):
     try:
         missing = [c for c in _TABLE_COLUMNS if c not in hdu.columns.names]
@@ -508,7 +496,7 @@ def _linear_header(obj, code, crpix, cd, crval):
     header["DETECTOR"] = (_ascii(solution.detector)[:60], "detector")
     if frame:
         header["FRAME"] = (_ascii(frame)[:60], "frame")
-    header["WPDCVERS"] = (_FORMAT_VERSION, "format version of wpdc_gwcs")
+    header["WPDCVERS"] = (FORMAT_VERSION, "format version of wpdc_gwcs")
     return header
 
 
@@ -534,7 +522,7 @@ def _add_history(header, text):
 def _write_hdus(hdus, path, overwrite):
     hdus = fits.HDUList(hdus)
     with atomic_path(path, overwrite=overwrite) as temporary:
-        hdus.writeto(temporary, checksum=False)
+        hdus.writeto(temporary, checksum=True)
 
 
 def _astropy_sky(hdus):

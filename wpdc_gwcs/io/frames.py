@@ -408,9 +408,22 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
         gain=image_gain(headers),
         saturation=image_saturation(headers),
         **_keys_of(headers, exposure_keyword, where),
-        meta=_facts(headers) | (_first_pixel(part["origin"]) if part["kind"] == "table" else {}),
+        meta=_facts(headers) | _choices(part),
+        inputs=tuple(c.path for c in part["companions"] if c.given),
         **loaders,
     )
+
+
+def _choices(part):
+    """State what of the file the frame is made of, where there was a choice."""
+    if part["kind"] == "table":
+        return _first_pixel(part["origin"])
+    if part["kind"] == "list":
+        return {}
+    facts = {c.role: f"{c.path}[{c.index}]" for c in part["companions"] if c.given}
+    if part["mask_bits"] is not None:
+        facts["mask_bits"] = part["mask_bits"]
+    return facts | ({"plane": part["plane"]} if part["plane"] != 0 else {})
 
 
 def _image_loaders(part, path):
