@@ -118,7 +118,7 @@ class DistortionSolution:
         Returns
         -------
         x, y : ndarray
-            Undistorted pixels; NaN off the detector.
+            Undistorted pixels; they go on off the detector.
         """
         return self.wcs.get_transform("detector", "undistorted")(x, y)
 
@@ -249,7 +249,7 @@ class Calibration:
         Returns
         -------
         x, y : ndarray
-            Undistorted pixels; NaN off the detector.
+            Undistorted pixels; they go on off the detector.
         """
         return self.wcs.get_transform("detector", "undistorted")(x, y)
 
