@@ -17,7 +17,6 @@ from wpdc_gwcs.io import read_wcs
 from wpdc_gwcs.io.dates import header_epoch
 from wpdc_gwcs.io.headers import (
     clean_header,
-    fold_attitude,
     header_number,
     header_shape,
     parse_tan,
@@ -26,6 +25,7 @@ from wpdc_gwcs.io.headers import (
     read_headers,
 )
 from wpdc_gwcs.models import PVPolynomial, project, pv_terms
+from wpdc_gwcs.models.attitude import fold_attitude
 
 
 def tpv_header(degree=3, *, radial=False, code="TPV", seed=0, **cards):

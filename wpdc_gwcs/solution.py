@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
+from wpdc_gwcs.export.memory import InMemory
 from wpdc_gwcs.models import LookupTable, PVPolynomial, deproject
 from wpdc_gwcs.wcs import build_wcs
 
@@ -20,7 +21,7 @@ __all__ = ["Calibration", "DistortionSolution"]
 
 
 @dataclass(frozen=True, eq=False)
-class DistortionSolution:
+class DistortionSolution(InMemory):
     """The distortion of one detector: what all its exposures share.
 
     Parameters
@@ -165,7 +166,7 @@ def _covariance(sigma, image_shape, x, y):
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(InMemory):
     """One calibrated frame: an instrument and the attitude of one exposure.
 
     Parameters

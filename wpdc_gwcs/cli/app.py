@@ -149,4 +149,4 @@ def main():
 
 
 # The commands register themselves with the application.
-from wpdc_gwcs.cli import calibrate, demo, files, stages  # noqa: E402, F401
+from wpdc_gwcs.cli import calibrate, demo, export, files, stages  # noqa: E402, F401

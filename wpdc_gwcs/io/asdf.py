@@ -107,7 +107,7 @@ def write_stock(obj, path, *, overwrite=False):
         Its greatest deviation from the exact WCS, px; `None` if the shape of the detector is
         unknown.
     """
-    from wpdc_gwcs.io.fits import deviation
+    from wpdc_gwcs.export import deviation
     from wpdc_gwcs.wcs import to_stock_wcs
 
     wcs = to_stock_wcs(obj.wcs)

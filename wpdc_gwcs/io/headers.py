@@ -22,14 +22,13 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.files import READ_ERRORS, file_kind, first_line, open_fits, split_extension
 from wpdc_gwcs.models import PVPolynomial, pv_terms
-from wpdc_gwcs.models.powers import expand_pv
+from wpdc_gwcs.models.attitude import fold_attitude
 
 __all__ = [
     "TanHeader",
     "clean_header",
     "extension_names",
     "find_extension",
-    "fold_attitude",
     "header_number",
     "header_shape",
     "header_text",
@@ -450,51 +449,6 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
         turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
         cd, pv = turn @ cd, fold_attitude(pv, turn)
     return TanHeader(crpix, cd, crval, pv, header_shape(header))
-
-
-def fold_attitude(pv, matrix):
-    """Rewrite a PV polynomial for other axes.
-
-    Parameters
-    ----------
-    pv : `~wpdc_gwcs.models.PVPolynomial`
-        Polynomial in U.
-    matrix : (2, 2) ndarray
-        A.
-
-    Returns
-    -------
-    folded : `~wpdc_gwcs.models.PVPolynomial`
-        The polynomial PV' with ``PV'(U) = A PV(A^-1 U)``, of the same degree.
-
-    Raises
-    ------
-    FileFormatError
-        If there are radial terms and A does more than turn, mirror and scale.
-    """
-    matrix = np.asarray(matrix, float)
-    if np.array_equal(matrix, np.eye(2)):
-        return pv
-    polynomial, radial = expand_pv(pv.coefficients, pv.degree, pv.radial, np.linalg.inv(matrix))
-    polynomial = np.einsum("ij,jpq->ipq", matrix, polynomial)
-    length = np.sqrt(abs(np.linalg.det(matrix)))
-    if radial is not None:
-        if not np.allclose(
-            matrix @ matrix.T, length**2 * np.eye(2), rtol=0, atol=1e-12 * length**2
-        ):
-            raise FileFormatError(
-                "PV with radial terms can only be turned and scaled as a whole, "
-                f"got the matrix {matrix.tolist()}"
-            )
-        radial = (matrix @ radial) * length ** -np.arange(radial.shape[1], dtype=float)
-    terms = pv_terms(pv.degree, pv.radial)
-    coefficients = np.zeros((2, len(terms.index)))
-    for k, (own, other, power) in enumerate(zip(terms.own, terms.other, terms.radius, strict=True)):
-        if power:
-            coefficients[:, k] = 0.0 if radial is None else radial[:, power]
-        else:
-            coefficients[:, k] = polynomial[0, own, other], polynomial[1, other, own]
-    return PVPolynomial.from_coefficients(coefficients, degree=pv.degree, radial=pv.radial)
 
 
 def _celestial_axes(header, name, error):
