@@ -1,4 +1,4 @@
-"""The WCS to other programs: `export`."""
+"""The WCS to other programs and from them: `export`, `convert`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -146,3 +146,52 @@ def _note(made):
         f" ({exact} for wpdc_gwcs, {made.keywords_deviation:.2g} px for readers of its keywords "
         "without the table)"
     )
+
+
+@app.command("convert", no_args_is_help=True)
+def convert_command(
+    file: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="ASDF with a gwcs, FITS or FITS[EXT] with a WCS of any kind, .head or text header.",
+        ),
+    ],
+    to: Annotated[
+        str,
+        typer.Option(
+            metavar="{asdf,fits,cpdis,tpv,head,sip,tab,stock}",
+            help="Format to write: asdf as wpdc calibrate writes it, the others as for wpdc export.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", metavar="OUT", help="File to write.")],
+    size: Annotated[
+        tuple[int, int] | None,
+        typer.Option(metavar="NX NY", help="Size of the image, where the file does not tell."),
+    ] = None,
+    degree: Degree = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+):
+    """Convert the WCS of any file to the models of wpdc, in any format; say how far it deviates."""
+    from wpdc_gwcs.camera import Camera
+    from wpdc_gwcs.io.any_wcs import read_any
+
+    formats = ("asdf", *FORMATS)
+    if to not in formats:
+        raise InputError(f"--to must be one of {', '.join(formats)}, got {to!r}")
+    if size is not None and min(size) < 2:
+        raise InputError(f"--size must be two numbers of 2 or more, got {size[0]} {size[1]}")
+    require_free(output, overwrite)
+    found = read_any(file, image_shape=None if size is None else size[::-1])
+    if isinstance(found, Camera):
+        raise InputError(f"{file}: is a camera of {len(found.detectors)} detectors")
+    try:
+        note = write_as(found, output, to, degree=degree, overwrite=overwrite)
+    except ValueError as err:
+        raise InputError(str(err)) from err
+    if not quiet:
+        worst = found.statistics.get("conversion_deviation")
+        read = "read exactly" if worst is None else f"read to {worst:.2g} px"
+        typer.echo(f"{output}: {read}, written as {to}{note}")
