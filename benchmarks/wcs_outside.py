@@ -2,7 +2,7 @@
 
 Run from the root of the project::
 
-    python benchmarks/wcs_outside.py                  # made-up detectors, 40 and 200 px of distortion
+    python benchmarks/wcs_outside.py                  # made up, 40 and 200 px of distortion
     python benchmarks/wcs_outside.py a.wcs.asdf ...   # calibrations of one's own
 
 A reader that is not installed is left out: astropy and galsim, esutil, starlink-pyast (PyPI), and

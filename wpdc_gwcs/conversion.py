@@ -13,7 +13,7 @@ from astropy.wcs.wcsapi import HighLevelWCSWrapper
 
 from wpdc_gwcs.exceptions import WPDCWarning
 from wpdc_gwcs.export import deviation
-from wpdc_gwcs.models import LookupTable, PVPolynomial, deproject, project, pv_terms
+from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 from wpdc_gwcs.models.powers import fit_polynomial, shift_origin
 from wpdc_gwcs.solution import Calibration, DistortionSolution
 
@@ -170,7 +170,7 @@ def _image_shape(wcs, image_shape):
 
 
 def _reference(wcs, sky, shape):
-    """Reference pixel and tangent point: its own where polynomials stand about it."""
+    """Give reference pixel and tangent point: its own where polynomials stand about it."""
     own = getattr(wcs, "wcs", None)
     if hasattr(own, "ctype") and all(c[4:].strip("-")[:3] in ("TAN", "TPV") for c in own.ctype):
         crpix = np.array(own.crpix, float) - 1.0

@@ -154,14 +154,14 @@ def convert_command(
         str,
         typer.Argument(
             metavar="FILE",
-            help="ASDF with a gwcs, FITS or FITS[EXT] with a WCS of any kind, .head or text header.",
+            help="ASDF with a gwcs, FITS or FITS[EXT] with any WCS, .head or text header.",
         ),
     ],
     to: Annotated[
         str,
         typer.Option(
             metavar="{asdf,fits,cpdis,tpv,head,sip,tab,stock}",
-            help="Format to write: asdf as wpdc calibrate writes it, the others as for wpdc export.",
+            help="asdf: as wpdc calibrate writes it; the others: as for wpdc export.",
         ),
     ],
     output: Annotated[Path, typer.Option("--output", metavar="OUT", help="File to write.")],
