@@ -288,6 +288,18 @@ def test_export(results, tmp_path, capsys, form):
     assert capsys.readouterr().out == ""
 
 
+def test_matches_have_the_sky_with_errors(results):
+    """Positions of the sources scatter about the reference stars as their errors say."""
+    for name in ("sim-01", "sim-02"):
+        matches = Table.read(results / f"{name}.matches.ecsv")
+        used = np.asarray(matches["used"])
+        east = (matches["source_ra"] - matches["ra"]) * np.cos(np.radians(matches["dec"]))
+        north = matches["source_dec"] - matches["dec"]
+        for offset, error in ((east, "ra_error"), (north, "dec_error")):
+            pull = np.asarray(offset)[used] * 3.6e6 / np.asarray(matches[error])[used]
+            assert 0.8 < mad_std(pull) < 1.2
+
+
 def test_export_into_an_image(results, tmp_path, capsys):
     file, image, copy = results / "sim-01.wcs.asdf", tmp_path / "a.fits", tmp_path / "b.fits"
     fits.writeto(image, np.zeros((1024, 1024), np.float32))

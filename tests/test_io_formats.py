@@ -517,10 +517,11 @@ def test_headers_without_an_image_know_its_size(tmp_path, calibration, form):
     if form == "head":
         header = fits.Header.fromtextfile(path)
     else:
-        with fits.open(path) as hdus:
+        with fits.open(path, checksum=True) as hdus:  # warnings are errors
             hdus.verify("exception")
             header = hdus[0].header.copy()
             assert not hdus[0].data.any()
+            assert header["DATASUM"] == "0"
         assert path.stat().st_size % 2880 == 0
     assert [header[k] for k in ("NAXIS", "NAXIS1", "NAXIS2", "WCSAXES")] == [2, 2048, 2064, 2]
     assert WCS(header).array_shape == (2064, 2048)

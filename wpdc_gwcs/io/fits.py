@@ -18,6 +18,7 @@ from wpdc_gwcs.export import (
     make_form,
     own_tables,
 )
+from wpdc_gwcs.io.checksum import checksum_text, sum_words
 from wpdc_gwcs.io.files import READ_ERRORS, atomic_path, file_kind, first_line, open_fits, stem_of
 from wpdc_gwcs.io.headers import (
     clean_header,
@@ -85,7 +86,9 @@ def write_form(obj, path, *, form, degree=None, overwrite=False):
         tables += own_tables(made.written)
     with atomic_path(path, overwrite=overwrite) as temporary:
         if tables or image_shape_of(obj) is None:
-            fits.HDUList([fits.PrimaryHDU(header=header), *tables]).writeto(temporary)
+            fits.HDUList([fits.PrimaryHDU(header=header), *tables]).writeto(
+                temporary, checksum=True
+            )
         else:
             _write_header(header, temporary, image_shape_of(obj))
     return made
@@ -131,6 +134,10 @@ def _write_header(header, path, shape):
     """Write a primary header and an image of zeros that is left out by the file system."""
     primary = fits.PrimaryHDU(header=header)
     primary.data = np.broadcast_to(np.uint8(0), shape)
+    # Zeros add up to nothing: the sum is that of the header.
+    primary.header["CHECKSUM"], primary.header["DATASUM"] = "0" * 16, "0"
+    total = sum_words(primary.header.tostring().encode("ascii"))
+    primary.header["CHECKSUM"] = checksum_text(total)
     text = primary.header.tostring().encode("ascii")
     size = -(-shape[0] * shape[1] // 2880) * 2880
     with open(path, "wb") as file:
