@@ -19,7 +19,8 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.wcs import WCS
+from astropy.nddata import CCDData, Cutout2D
+from astropy.wcs import WCS, WcsError
 
 from wpdc_gwcs import DistortionSolution, read
 from wpdc_gwcs.export import FORMS
@@ -179,6 +180,43 @@ def read_swarp(obj, path):
     return float(np.hypot(*worst))
 
 
+def cutouts(obj):
+    """Print what is left of each form in cut-outs and files of astropy, px."""
+    ny, nx = getattr(obj, "solution", obj).image_shape
+    x0, x1, y0, y1 = nx // 8, nx // 2, ny // 2, ny - ny // 8
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(x0, x1, 2000), rng.uniform(y0, y1, 2000)
+    data = np.broadcast_to(np.float32(0), (ny, nx))
+    titles = ("whole", "Cutout2D", "CCDData", "written", "header")
+    print(f"\n{'astropy':10}" + "".join(f"{title:>10}" for title in titles))
+    for form in ("tpv", "sip", "cpdis", "tab"):
+        wcs = obj.to_astropy_wcs(form)
+        image = CCDData(np.array(data), wcs=wcs, unit="adu")
+        middle, size = ((x0 + x1) // 2, (y0 + y1) // 2), (y1 - y0, x1 - x0)
+
+        def written(image=image):
+            with tempfile.TemporaryDirectory() as folder:
+                image.write(Path(folder) / "a.fits")
+                return CCDData.read(Path(folder) / "a.fits").wcs
+
+        cut = Cutout2D(data, middle, size, wcs=wcs)
+        cases = (
+            (lambda wcs=wcs: wcs, (0, 0)),
+            (lambda cut=cut: cut.wcs, cut.origin_original),
+            (lambda image=image: image[y0:y1, x0:x1].wcs, (x0, y0)),
+            (written, (0, 0)),
+            (lambda wcs=wcs: WCS(wcs.to_header(relax=True)), (0, 0)),
+        )
+        row = []
+        for make, (dx, dy) in cases:
+            try:
+                found = make().all_pix2world(x - dx, y - dy, 0)
+                row.append(f"{deviation(obj, x, y, found):.2g}")
+            except (ValueError, AttributeError, WcsError):
+                row.append("none")
+        print(f"{form:10}" + "".join(f"{cell:>10}" for cell in row))
+
+
 def main():
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -227,6 +265,9 @@ def main():
                     f"{form:8}"
                     + "".join(f"{'' if v is None else format(v, '10.2g'):>10}" for v in row)
                 )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            cutouts(obj)
 
 
 if __name__ == "__main__":
