@@ -103,7 +103,11 @@ def _read_header(path, image_shape):
     with open_fits(plain) as hdus:
         if extension is not None:
             find_extension(hdus, extension, plain)
-        wcs = parse_wcs(header, hdus=hdus, name=str(path))
+        try:
+            wcs = parse_wcs(header, hdus=hdus, name=str(path))
+        except MemoryError as problem:
+            # What wcslib says to a -TAB of absurd size.
+            raise FileFormatError(f"{path}: not a usable WCS: {first_line(problem)}") from problem
     return _fit(wcs, path, image_shape or header_shape(header))
 
 
