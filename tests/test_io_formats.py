@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import warnings
+from dataclasses import replace
 
 import asdf
 import numpy as np
@@ -17,9 +18,10 @@ from numpy.polynomial import polynomial
 
 from wpdc_gwcs import build_wcs
 from wpdc_gwcs.exceptions import FileFormatError, InputError, WPDCWarning
+from wpdc_gwcs.export import FORMAT_VERSION, FORMS, make_form
 from wpdc_gwcs.io import OutputExistsError, read, read_wcs, write
 from wpdc_gwcs.io.asdf import _loaded
-from wpdc_gwcs.io.integrity import FORMAT_VERSION, content_sum
+from wpdc_gwcs.io.integrity import content_sum
 from wpdc_gwcs.lookup import ResidualMap
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 from wpdc_gwcs.solution import Calibration, DistortionSolution
@@ -389,24 +391,150 @@ def test_cpdis_of_others_is_not_read_in_part(tmp_path, calibration):
 
 
 def test_cpdis_says_when_it_cannot(tmp_path, monkeypatch, calibration):
-    monkeypatch.setattr("wpdc_gwcs.io.fits._CPDIS_MOST_NODES", 10)
+    monkeypatch.setattr("wpdc_gwcs.export.cpdis._MOST_NODES", 10)
     with pytest.warns(WPDCWarning, match="cannot be made dense enough"):
         worst = write(calibration, tmp_path / "a.fits", format="cpdis")
     assert worst > 1e-3
 
 
-def test_head_is_ascii_and_the_pv_part(tmp_path, calibration):
+def test_head_is_ascii_and_all_of_it(tmp_path, calibration):
     calibration.settings["observer"] = "Gärtner"
     worst = write(calibration, tmp_path / "a.head")
-    assert 0.05 < worst < 1.0  # the look-up table
+    assert 0.05 < worst < 1.0  # a table as rough as noise
     text = (tmp_path / "a.head").read_bytes()
     assert text.isascii()
     lines = text.decode().splitlines()
     assert all(len(line) == 80 for line in lines)
     assert lines[-1].rstrip() == "END"
+    found = distance(calibration, read(tmp_path / "a.head").wcs(*grid(calibration)))
+    assert 0.9 * worst < found < 1.01 * worst
+    # Without a table, the polynomial is what it was.
     plain = make_calibration(table=None)
-    assert distance(plain, read(tmp_path / "a.head").wcs(*grid(plain))) < 1e-9
     assert write(plain, tmp_path / "b.head") < 1e-6
+    assert distance(plain, read(tmp_path / "b.head").wcs(*grid(plain))) < 1e-9
+
+
+def smooth_calibration(degree, *, n=2048, amplitude=40.0, seed=3):
+    """A cubic and a table that together are a polynomial of the given degree."""
+    whole = make_calibration(n=n, degree=degree, amplitude=amplitude, table=None, seed=seed)
+    solution = whole.solution
+    ny, nx = solution.image_shape
+    nodes = [np.linspace(-0.5, size - 0.5, 50) for size in (nx, ny)]
+    x, y = np.meshgrid(*nodes)
+    terms = pv_terms(3)
+    cubic = PVPolynomial.from_coefficients(
+        solution.pv.coefficients[:, : len(terms.index)], degree=3
+    )
+    offset = np.array([x.ravel(), y.ravel()]) - solution.crpix[:, None]
+    u = solution.cd @ offset
+    left = np.linalg.solve(solution.cd, np.subtract(cubic(*u), solution.pv(*u)))
+    table = LookupTable(*nodes, *left.reshape(2, *x.shape))
+    return replace(whole, solution=replace(solution, pv=cubic, lookup_table=table))
+
+
+@pytest.mark.parametrize("form", ["tpv", "head"])
+@pytest.mark.parametrize("degree", [5, 7])
+def test_tpv_has_the_whole_mapping(tmp_path, form, degree):
+    """A distortion that is a polynomial comes out as one, though it came as cubic and table."""
+    calibration = smooth_calibration(degree)
+    path = tmp_path / ("a.head" if form == "head" else "a.fits")
+    worst = write(calibration, path, format=form)
+    assert worst < (1e-3 if degree == 5 else 5e-3)  # what the spline of the table leaves
+    header = read(path)
+    assert header.solution.pv.degree == degree
+    x, y = grid(calibration, 97)
+    found = distance_at(calibration, header.wcs(x, y), x, y)
+    assert found < 1.1 * worst + 1e-9
+    # The cubic alone is off by pixels, and `fits` says so to those who do not read its table.
+    made = make_form(calibration, "fits")
+    assert made.deviation is None
+    assert made.keywords_deviation > make_form(calibration, "tpv", degree=3).deviation > 1.0
+
+
+def distance_at(calibration, sky, x, y):
+    """Greatest distance in px of other sky positions of some pixels."""
+    planes = [project(*s, calibration.crval) for s in (sky, calibration.wcs(x, y))]
+    return np.hypot(*np.linalg.solve(calibration.cd, np.subtract(*planes))).max()
+
+
+@pytest.mark.parametrize("form", ["tpv", "sip", "fits", "cpdis"])
+def test_degree_is_as_asked_for(tmp_path, form):
+    calibration = smooth_calibration(5, amplitude=10.0)
+    worst = {n: write(calibration, tmp_path / f"{n}.fits", format=form, degree=n) for n in (3, 5)}
+    header = fits.getheader(tmp_path / "5.fits")
+    if form == "sip":
+        assert header["A_ORDER"] == 5
+    else:
+        assert "PV1_22" in header
+        assert "PV1_24" not in header
+        assert "PV1_12" not in fits.getheader(tmp_path / "3.fits")
+    assert worst[5] < 1e-3
+    assert (worst[3] > 0.1) == (form in ("tpv", "sip"))
+    if form in ("fits", "cpdis"):
+        back = read(tmp_path / "5.fits").wcs(*grid(calibration))
+        assert distance(calibration, back) < 1e-3
+    for bad in (0, 10):
+        with pytest.raises(ValueError, match=f"degree must be from .* got {bad}"):
+            write(calibration, tmp_path / "b.fits", format=form, degree=bad)
+    assert not (tmp_path / "b.fits").exists()
+
+
+def test_degree_has_no_meaning_for_tables(tmp_path, calibration):
+    for form in ("tab", "stock", "asdf"):
+        with pytest.raises(ValueError, match="degree has no meaning"):
+            write(calibration, tmp_path / "a", format=form, degree=3)
+
+
+def test_reference_point_far_from_the_detector(tmp_path):
+    """As in a mosaic: the powers about it are large and cancel."""
+    calibration = make_calibration(amplitude=5.0, table="cubic")
+    solution = replace(calibration.solution, crpix=np.array([-9000.0, 12000.0]))
+    calibration = replace(calibration, solution=solution)
+    worst = write(calibration, tmp_path / "a.fits", format="tpv")
+    x, y = grid(calibration)
+    found = distance_at(calibration, read(tmp_path / "a.fits").wcs(x, y), x, y)
+    assert found < 1.05 * worst
+    assert worst < 0.5
+
+
+@pytest.mark.parametrize("crval", [(0.0001, 0.0), (200.0, -60.0)])
+@pytest.mark.parametrize("table", [None, "cubic"])
+def test_tab_is_what_wcslib_reads(tmp_path, crval, table):
+    calibration = make_calibration(crval=crval, amplitude=100.0, table=table)
+    worst = write(calibration, tmp_path / "a.fits", format="tab")
+    assert worst < 1e-3
+    wcs = astropy_wcs(tmp_path / "a.fits")
+    rng = np.random.default_rng(0)
+    ny, nx = calibration.solution.image_shape
+    x, y = rng.uniform(-0.5, nx - 0.5, 20000), rng.uniform(-0.5, ny - 0.5, 20000)
+    assert distance_at(calibration, wcs.all_pix2world(x, y, 0), x, y) < 1.1 * worst
+    back = np.array(wcs.wcs_world2pix(*wcs.wcs_pix2world(x[:50], y[:50], 0), 0))
+    np.testing.assert_allclose(back, [x[:50], y[:50]], atol=1e-4)
+
+
+def test_tab_says_that_it_has_no_pole(tmp_path):
+    calibration = make_calibration(n=256, crval=(10.0, 89.999), scale=3.0, table=None)
+    with pytest.warns(WPDCWarning, match="readers deviate by up to"):
+        assert write(calibration, tmp_path / "a.fits", format="tab") > 1.0
+
+
+@pytest.mark.parametrize("form", ["tpv", "sip", "head"])
+def test_headers_without_an_image_know_its_size(tmp_path, calibration, form):
+    """Readers such as esutil, sip_tpv and wcstools want NAXIS1 and NAXIS2."""
+    path = tmp_path / ("a.head" if form == "head" else "a.fits")
+    write(calibration, path, format=form)
+    if form == "head":
+        header = fits.Header.fromtextfile(path)
+    else:
+        with fits.open(path, checksum=True) as hdus:  # warnings are errors
+            hdus.verify("exception")
+            header = hdus[0].header.copy()
+            assert not hdus[0].data.any()
+            assert header["DATASUM"] == "0"
+        assert path.stat().st_size % 2880 == 0
+    assert [header[k] for k in ("NAXIS", "NAXIS1", "NAXIS2", "WCSAXES")] == [2, 2048, 2064, 2]
+    assert WCS(header).array_shape == (2064, 2048)
+    assert read_wcs(path).array_shape == (2064, 2048)
 
 
 def test_head_for_galsim(tmp_path):
@@ -617,7 +745,7 @@ def test_format_by_ending_and_by_name(tmp_path, calibration):
     assert sorted(os.listdir(tmp_path)) == ["t.ecsv"]
 
 
-@pytest.mark.parametrize("format", ["asdf", "fits", "cpdis", "head", "sip", "stock"])
+@pytest.mark.parametrize("format", ["asdf", *FORMS, "stock"])
 def test_existing_files_are_kept(tmp_path, calibration, format):
     path = tmp_path / "a.out"
     path.write_text("precious")
@@ -710,6 +838,17 @@ def test_a_number_that_still_reads_as_one_is_found(tmp_path, calibration):
         (tmp_path / "b.asdf").write_bytes(data.replace(old, new))
         with pytest.raises(FileFormatError, match="do not agree with their 'content_sum'"):
             read(tmp_path / "b.asdf")
+
+
+@pytest.mark.parametrize("form", ["fits", "tpv", "cpdis"])
+def test_a_digit_of_a_header_of_ours_is_found(tmp_path, calibration, form):
+    write(calibration, tmp_path / "a.fits", format=form)
+    data = (tmp_path / "a.fits").read_bytes()
+    at = data.index(b".", data.index(b"CRVAL1")) + 3
+    digit = b"1" if data[at : at + 1] != b"1" else b"2"
+    (tmp_path / "b.fits").write_bytes(data[:at] + digit + data[at + 1 :])
+    with pytest.raises(FileFormatError, match="HDU 0 must agree with its CHECKSUM and DATASUM"):
+        read(tmp_path / "b.fits")
 
 
 def test_a_later_minor_version_opens(tmp_path, calibration):

@@ -19,6 +19,7 @@ _PUBLIC = {
     "build_wcs": "wcs",
     "to_stock_wcs": "wcs",
     "sky_map": "wcs",
+    "fit_wcs": "conversion",
     "DistortionSolution": "solution",
     "Calibration": "solution",
     "Camera": "camera",

@@ -81,7 +81,7 @@ class Camera:
         Returns
         -------
         x, y : ndarray
-            Focal plane, px; NaN off the detector.
+            Focal plane, px; it goes on off the detector.
 
         Raises
         ------

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
+from wpdc_gwcs.export.memory import InMemory
 from wpdc_gwcs.models import LookupTable, PVPolynomial, deproject
 from wpdc_gwcs.wcs import build_wcs
 
@@ -82,7 +83,7 @@ def _freeze_sigma(owner, name):
 
 
 @dataclass(frozen=True, eq=False)
-class DistortionSolution:
+class DistortionSolution(InMemory):
     """The distortion of one detector: what all its exposures share.
 
     Parameters
@@ -198,7 +199,7 @@ class DistortionSolution:
         Returns
         -------
         x, y : ndarray
-            Undistorted pixels; NaN off the detector.
+            Undistorted pixels; they go on off the detector.
         """
         return self.wcs.get_transform("detector", "undistorted")(x, y)
 
@@ -245,7 +246,7 @@ def _covariance(sigma, image_shape, x, y):
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(InMemory):
     """One calibrated frame: an instrument and the attitude of one exposure.
 
     Parameters
@@ -334,7 +335,7 @@ class Calibration:
         Returns
         -------
         x, y : ndarray
-            Undistorted pixels; NaN off the detector.
+            Undistorted pixels; they go on off the detector.
         """
         return self.wcs.get_transform("detector", "undistorted")(x, y)
 

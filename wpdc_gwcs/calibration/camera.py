@@ -11,6 +11,7 @@ from astropy.table import Table
 
 from wpdc_gwcs.calibration.checks import check_solution, shortcomings
 from wpdc_gwcs.calibration.matched import optional_column
+from wpdc_gwcs.calibration.positions import with_sky_positions
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import (
     LinearWCS,
@@ -462,7 +463,7 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
     reasons = shortcomings(frame, calibration, held=held, known=known, stored=stored)
     statistics["status"] = "degraded" if reasons else "solved"
     statistics["reasons"] = reasons
-    return calibration
+    return with_sky_positions(calibration)
 
 
 def _provenance(group, before=None):

@@ -1,4 +1,4 @@
-"""Commands on results: `export`, `pix2sky`, `sky2pix`, `evaluate`, `monitor`."""
+"""Commands on results: `pix2sky`, `sky2pix`, `evaluate`, `monitor`."""
 
 from dataclasses import replace
 from functools import partial
@@ -12,8 +12,6 @@ from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free, require_plotting
 from wpdc_gwcs.exceptions import InputError
 
-FORMATS = ("fits", "cpdis", "head", "sip", "stock")
-
 CalibrationFile = Annotated[
     Path,
     typer.Argument(metavar="FILE", help="A *.wcs.asdf, *.solution.asdf or exported FITS file."),
@@ -26,35 +24,6 @@ Output = Annotated[
     Path | None,
     typer.Option("--output", metavar="FILE", help="Write the table here instead of printing it."),
 ]
-
-
-@app.command("export", no_args_is_help=True)
-def export_command(
-    file: CalibrationFile,
-    format: Annotated[
-        str,
-        typer.Option(
-            "--format",
-            metavar="{fits,cpdis,head,sip,stock}",
-            help="fits: TPV + table, exact; cpdis: for astropy.wcs; head: for SWarp, SCAMP; "
-            "sip: for DS9; stock: gwcs alone.",
-        ),
-    ],
-    output: Annotated[Path, typer.Option("--output", metavar="OUT", help="File to write.")],
-    overwrite: Overwrite = False,
-    verbose: Verbose = 0,
-    quiet: Quiet = False,
-):
-    """Write a calibrated WCS in a format that other programs read; say how far it deviates."""
-    from wpdc_gwcs.io import write
-
-    if format not in FORMATS:
-        raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
-    require_free(output, overwrite)
-    deviation = write(read_one(file), output, format=format, overwrite=overwrite)
-    if not quiet:
-        note = "" if deviation is None else f" (greatest deviation {deviation:.2g} px)"
-        typer.echo(f"{output}: written as {format}{note}")
 
 
 def read_one(file):

@@ -36,12 +36,12 @@ from pathlib import Path
 
 import asdf
 import numpy as np
-import yaml
 
 from wpdc_gwcs.camera import Camera
 from wpdc_gwcs.exceptions import FileFormatError, InputError
+from wpdc_gwcs.export import FORMAT_VERSION
 from wpdc_gwcs.io.files import READ_ERRORS, as_utf8, atomic_path, first_line
-from wpdc_gwcs.io.integrity import FORMAT_VERSION, check_size, check_version, content_sum
+from wpdc_gwcs.io.integrity import check_size, check_version, content_sum
 from wpdc_gwcs.lookup import ResidualMap
 from wpdc_gwcs.models import LookupTable, PVPolynomial
 from wpdc_gwcs.solution import Calibration, DistortionSolution
@@ -110,7 +110,7 @@ def write_stock(obj, path, *, overwrite=False):
         Its greatest deviation from the exact WCS, px; `None` if the shape of the detector is
         unknown.
     """
-    from wpdc_gwcs.io.fits import deviation
+    from wpdc_gwcs.export import deviation
     from wpdc_gwcs.wcs import to_stock_wcs
 
     wcs = to_stock_wcs(obj.wcs)
@@ -264,7 +264,7 @@ def _read_entry(path, key, *, whole=False):
                 stream, lazy_load=False, memmap=False, lazy_tree=True, validate_checksums=True
             ) as file:
                 return _loaded(file.tree.get(key))
-    except (asdf.exceptions.ValidationError, yaml.YAMLError, MemoryError, *READ_ERRORS) as problem:
+    except (asdf.exceptions.ValidationError, *READ_ERRORS) as problem:
         raise FileFormatError(
             f"{path}: damaged or truncated ASDF file: {first_line(problem)}"
         ) from problem

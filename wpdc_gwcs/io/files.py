@@ -25,6 +25,7 @@ __all__ = [
     "file_kind",
     "first_line",
     "open_fits",
+    "open_stream",
     "place",
     "split_extension",
     "stem_of",
@@ -230,6 +231,31 @@ def _check_once(path, error):
     if seen is None or _complete.get(path, (None,))[0] != seen:
         _complete[path] = seen, check_complete(path, error=error)
     return _complete[path][1]
+
+
+@contextlib.contextmanager
+def open_stream(path, mode="rb", *, like=None):
+    """Open a file for its bytes, decompressed and compressed on the way.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    mode : {"rb", "wb"}, optional
+        To read or to write.
+    like : path-like, optional
+        File whose compression a new file gets; itself by default.
+
+    Yields
+    ------
+    stream : file object
+        Of the bytes before compression.
+    """
+    with open(path if like is None else like, "rb") as file:
+        start = file.read(9)
+    kind = next((k for magic, k in _MAGIC if start.startswith(magic)), None)
+    with _OPENERS.get(kind, open)(path, mode) as stream:
+        yield stream
 
 
 def check_complete(path, *, error=FileFormatError):

@@ -10,21 +10,19 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import yaml
+from astropy.io import fits
 
 from wpdc_gwcs.exceptions import FileFormatError
+from wpdc_gwcs.export import FORMAT_VERSION
 from wpdc_gwcs.io.files import READ_ERRORS, first_line
 
 __all__ = [
-    "FORMAT_VERSION",
     "check_size",
     "check_sums",
     "check_version",
     "content_sum",
     "parse_version",
 ]
-
-#: Version of all formats of this package that can be read back, ASDF and FITS.
-FORMAT_VERSION = "1.2.0"
 
 # A solution of 100,000 frames names each of them; all else is small.
 _MOST_NODES = 1_000_000
@@ -103,10 +101,9 @@ def check_sums(hdus, path):
         images of others are not asked: the sums that came with them are those of another HDU.
     """
     for number, hdu in enumerate(hdus):
-        ours = hdu.header.get("NAXIS") == 0 or hdu.name.startswith("WPDC_")
         try:
             # Not 0, which is a wrong sum; 2 is no sum at all.
-            agrees = not ours or (hdu.verify_checksum() and hdu.verify_datasum())
+            agrees = not _is_ours(hdu) or (hdu.verify_checksum() and hdu.verify_datasum())
         except READ_ERRORS as problem:
             raise FileFormatError(f"{path}: damaged FITS file: {first_line(problem)}") from problem
         if not agrees:
@@ -114,6 +111,15 @@ def check_sums(hdus, path):
                 f"{path}: HDU {number} must agree with its CHECKSUM and DATASUM, does not: "
                 "damaged, or edited without new sums (astropy: writeto(..., checksum=True))"
             )
+
+
+def _is_ours(hdu):
+    """Tell our tables, and our headers as they were written: alone, or before zeros."""
+    if hdu.name.startswith("WPDC_"):
+        return True
+    if "WPDCVERS" not in hdu.header or not isinstance(hdu, fits.PrimaryHDU):
+        return False
+    return hdu.data is None or not hdu.data.any()
 
 
 def content_sum(tree):
