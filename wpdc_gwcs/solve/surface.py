@@ -10,9 +10,12 @@ __all__ = ["SampledField", "SummedField", "TableSurface", "of_field", "of_table"
 # Nodes for the shortest wave of a field: the spline then is good to a thousandth of it.
 _NODES_PER_WAVE = 6
 
-# Share of its own size by which the grid of a field reaches beyond its box on each side: distortion
-# takes stars over the rim.
-_MARGIN = 0.02
+# Steps over a box at least: twice those of a table, so that its nodes are among them.
+_LEAST_STEPS = 98
+
+# Steps by which the grid of a field reaches beyond its box on each side: distortion takes stars
+# over the rim.
+_BEYOND = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +174,8 @@ def of_field(field, low, high):
     """
     size = high - low
     shortest = 2 * np.pi / np.abs(field.wave).max(axis=1)
-    n = np.ceil(_NODES_PER_WAVE * size / shortest).astype(int) + 4
-    grids = [
-        np.linspace(a - _MARGIN * s, b + _MARGIN * s, m) for a, b, s, m in zip(low, high, size, n)
-    ]
+    steps = np.maximum(np.ceil(_NODES_PER_WAVE * size / shortest).astype(int), _LEAST_STEPS)
+    grids = [a + s / n * np.arange(-_BEYOND, n + _BEYOND + 1) for a, s, n in zip(low, size, steps)]
     x, y = np.meshgrid(*grids, indexing="ij")
     values = field(np.array([x.ravel(), y.ravel()])).reshape(2, *x.shape)
     return SampledField(field, TableSurface(tuple(RectBivariateSpline(*grids, v) for v in values)))

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
+from scipy.interpolate import CubicSpline
 from scipy.linalg import lapack
 
 __all__ = ["Waves", "candidates", "fit_waves"]
@@ -29,6 +30,11 @@ _SHORTEST = 0.1
 # they are to be fitted freely beside the waves: they have taken a part of them already.
 _DEGREE = 9
 _FREE_DEGREE, _STARS_PER_TERM = 5, 40
+
+# Detectors roll off within some pixels of their rims.  A table takes of it what its outermost nodes
+# can: these are shapes, too, of a table of so many nodes.
+_NODES = 50
+_OUTERMOST = CubicSpline(np.arange(_NODES), np.eye(_NODES)[0])
 
 # Share of the variance that a coefficient has by itself, from all stars, which is left to a wave
 # that is not seen, and the number of coefficients that this guess is worth.  In noise alone a
@@ -46,12 +52,15 @@ _ZOOMS, _SEEN = 2, 0.5
 _MOST_ZOOMED = 60
 
 # With more stars than this they are averaged in cells, so many along the shortest wave.
-_MOST_STARS, _CELLS_PER_WAVE = 20_000, 20
+_MOST_STARS, _CELLS_PER_WAVE = 20_000, 16
+
+# Stars of which the columns are held in memory at once.
+_BLOCK = 4096
 
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """Displacements of the focal plane as a sum of plane waves and polynomials.
+    """Displacements of the focal plane: plane waves, polynomials, and what the rims differ by.
 
     Parameters
     ----------
@@ -62,7 +71,9 @@ class Waves:
     least_degree : int
         Of the polynomials; those below are in other terms.
     coefficients : (2, K) ndarray
-        Of cosines, sines and polynomials, for each axis, px.
+        Of cosines, sines, polynomials and rims, for each axis, px.
+    taken : (F, K) ndarray
+        What the polynomials of lower degree take of each shape, where the stars are.
     half : (K, K) ndarray
         Products of these with themselves, H^T H, are the covariance of the coefficients of an axis.
     """
@@ -72,6 +83,7 @@ class Waves:
     wave: np.ndarray
     least_degree: int
     coefficients: np.ndarray
+    taken: np.ndarray
     half: np.ndarray
 
     def __call__(self, focal):
@@ -90,7 +102,7 @@ class Waves:
         return self.coefficients @ self._columns(focal).T
 
     def covariance(self, focal):
-        """Posterior covariance, the same along both axes.
+        """Posterior covariance, the same along both axes, with what other terms make up for.
 
         Parameters
         ----------
@@ -102,7 +114,8 @@ class Waves:
         (2, 2, N) ndarray
             Px^2.
         """
-        rows = self.half @ self._columns(focal).T
+        free = _polynomials(self.center, self.size, focal, range(self.least_degree))
+        rows = self.half @ (self._columns(focal) - free @ self.taken).T
         out = np.zeros((2, 2, focal.shape[1]))
         out[0, 0] = out[1, 1] = np.sum(rows**2, axis=0)
         return out
@@ -112,10 +125,18 @@ class Waves:
 
 
 def _columns(center, size, wave, least_degree, focal):
-    """Cosines and sines, and the polynomials of the higher degrees."""
+    """Cosines and sines, the polynomials of the higher degrees, and the rims."""
     phase = (focal - center[:, None]).T @ wave
     high = _polynomials(center, size, focal, range(least_degree, _DEGREE + 1))
-    return np.hstack([np.cos(phase), np.sin(phase), high])
+    return np.hstack([np.cos(phase), np.sin(phase), high, _rims(center, size, focal)])
+
+
+def _rims(center, size, focal):
+    """Splines that are one at one side of the detector and zero at all other nodes."""
+    node = (_NODES - 1) * ((focal - center[:, None]) / size[:, None] + 0.5)
+    return np.transpose([
+        _OUTERMOST(np.clip(n, 0, _NODES - 1)) for along in node for n in (along, _NODES - 1 - along)
+    ])  # fmt: skip
 
 
 def _polynomials(center, size, focal, degrees):
@@ -176,7 +197,7 @@ def fit_waves(low, high, focal, residual, variance):
 
     Notes
     -----
-    The four coefficients of a wave, or the two of a polynomial, have the variance p; evidence is
+    The four coefficients of a wave, or the two of any other shape, have the variance p; evidence is
     largest at p = m^2 / g, with the sum m^2 of the squares of their posterior means, and g, the
     number of them that the stars determine (MacKay's step).  Both axes have the mean of their
     weights.
@@ -196,7 +217,7 @@ def fit_waves(low, high, focal, residual, variance):
     least_degree = max(np.count_nonzero(terms * _STARS_PER_TERM <= focal.shape[1]), 2)
     for zoom in range(_ZOOMS + 1):
         shape = center, size, orders * step[:, None], least_degree
-        normal, right = _normal_equations(shape, focal, residual, weight)
+        normal, right, taken = _normal_equations(shape, focal, residual, weight)
         root, known = _learned(normal, right, orders.shape[1], _FLOOR / weight.sum())
         seen = np.flatnonzero(known > _SEEN)
         if zoom == _ZOOMS or not seen.size:
@@ -204,7 +225,7 @@ def fit_waves(low, high, focal, residual, variance):
         strong = seen[np.argsort(-root[seen], kind="stable")[:_MOST_ZOOMED]]
         orders, step = _finer(orders[:, seen], orders[:, strong]), 0.5 * step
     half = lapack.dtrtrs(_factor(normal, root), np.diag(root), lower=1)[0]
-    return Waves(*shape, (half.T @ (half @ right)).T, half.astype(np.float32))
+    return Waves(*shape, (half.T @ (half @ right)).T, taken, half.astype(np.float32))
 
 
 def _learned(normal, right, n, least):
@@ -231,17 +252,26 @@ def _factor(normal, root):
 
 def _normal_equations(shape, focal, residual, weight):
     """Take free polynomials out of the normal matrix and the right-hand sides."""
-    rows = _columns(*shape, focal)
-    free = _polynomials(*shape[:2], focal, range(shape[3]))
-    heavy = rows * weight[:, None]
-    normal, right = heavy.T @ rows, heavy.T @ residual.T
-    cross = free.T @ heavy
-    solved = np.linalg.lstsq(
-        (free * weight[:, None]).T @ free,
-        np.hstack([cross, free.T @ (weight * residual).T]),
-        rcond=1e-12,
-    )[0]
-    return normal - cross.T @ solved[:, :-2], right - cross.T @ solved[:, -2:]
+    total = 0.0
+    for start in range(0, len(weight), _BLOCK):
+        s = slice(start, start + _BLOCK)
+        rows = [
+            _columns(*shape, focal[:, s]),
+            _polynomials(*shape[:2], focal[:, s], range(shape[3])),
+            residual[:, s].T,
+        ]
+        rows = np.hstack(rows) * np.sqrt(weight[s, None])
+        total = total + rows.T @ rows
+    k, f = len(total) - 2, sum(range(shape[3] + 1))
+    shapes, free = slice(k - f), slice(k - f, k)
+    cross = total[free, shapes]
+    solved = np.linalg.lstsq(total[free, free], np.hstack([cross, total[free, k:]]), rcond=1e-12)[0]
+    taken = solved[:, :-2]
+    return (
+        total[shapes, shapes] - cross.T @ taken,
+        total[shapes, k:] - cross.T @ solved[:, -2:],
+        taken,
+    )
 
 
 def _averaged(focal, residual, weight, side):
