@@ -17,6 +17,7 @@ from wpdc_gwcs.calibration.start import (
     sky_of,
 )
 from wpdc_gwcs.catalogs import fill_motions, propagate, read_catalog, select_cone
+from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
 from wpdc_gwcs.selection import left_out
@@ -26,7 +27,6 @@ __all__ = [
     "MatchedFrame",
     "catalog_of_frame",
     "match_frame",
-    "optional_column",
     "reference_in_reach",
     "usable_sources",
     "with_errors",
@@ -126,10 +126,10 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
             ys[pick],
             xr,
             yr,
-            flux=optional_column(sources, "flux", pick),
-            mag=optional_column(reference, "phot_g_mean_mag"),
-            x_err=optional_column(sources, "x_err", pick),
-            y_err=optional_column(sources, "y_err", pick),
+            flux=numbers_or_none(sources, "flux", pick),
+            mag=numbers_or_none(reference, "phot_g_mean_mag"),
+            x_err=numbers_or_none(sources, "x_err", pick),
+            y_err=numbers_or_none(sources, "y_err", pick),
             image_shape=frame.image_shape,
             blind=settings.blind,
         )
@@ -156,26 +156,6 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     )
 
 
-def optional_column(table, name, rows=slice(None)):
-    """Rows of a column as floats, or None where the table does not have it.
-
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        Any table.
-    name : str
-        Name of the column.
-    rows : slice or array_like, optional
-        Rows; default all.
-
-    Returns
-    -------
-    ndarray or None
-        Values.
-    """
-    return np.asarray(table[name], dtype=float)[rows] if name in table.colnames else None
-
-
 def with_errors(sources):
     """Add errors by signal-to-noise where a list has none; their scale is fitted later.
 
@@ -193,7 +173,7 @@ def with_errors(sources):
         return sources
     sources = sources.copy()
     # A star of FWHM 2.4 px has a centroid error of 1 / snr px, and no centroid is perfect.
-    error = np.hypot(1.0 / np.maximum(np.asarray(sources["snr"], float), 1.0), _ERROR_FLOOR)
+    error = np.hypot(1.0 / np.maximum(numbers_or_none(sources, "snr"), 1.0), _ERROR_FLOOR)
     sources["x_err"] = sources["y_err"] = error
     return sources
 

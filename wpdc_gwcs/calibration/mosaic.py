@@ -23,13 +23,13 @@ from wpdc_gwcs.calibration.geometry import LocalPairs, fit_geometry
 from wpdc_gwcs.calibration.matched import (
     FailedFrame,
     MatchedFrame,
-    optional_column,
     reference_in_reach,
     usable_sources,
     with_errors,
 )
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs, sky_of
+from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching import SmoothMap, match_nearby, match_planes
 from wpdc_gwcs.threads import one_blas_thread
@@ -291,8 +291,8 @@ def _stars(task, prediction, catalog, settings):
         xs[pick],
         ys[pick],
         *start.pixels(reference["ra"], reference["dec"]),
-        optional_column(task.sources, "flux", pick),
-        optional_column(reference, "phot_g_mean_mag"),
+        numbers_or_none(task.sources, "flux", pick),
+        numbers_or_none(reference, "phot_g_mean_mag"),
     )
 
 
@@ -370,8 +370,8 @@ def _match(task, prediction, catalog, settings, **search):
                 *start.pixels(stars.reference["ra"], stars.reference["dec"]),
                 flux=stars.flux,
                 mag=stars.mag,
-                x_err=optional_column(sources, "x_err", stars.pick),
-                y_err=optional_column(sources, "y_err", stars.pick),
+                x_err=numbers_or_none(sources, "x_err", stars.pick),
+                y_err=numbers_or_none(sources, "y_err", stars.pick),
                 image_shape=frame.image_shape,
                 start=SmoothMap.identity(frame.image_shape),
             )

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wpdc_gwcs.calibration.matched import optional_column
+from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.models import deproject, project
 
 __all__ = ["sky_positions", "with_sky_positions"]
@@ -103,7 +103,7 @@ def with_sky_positions(calibration):
 
 def _of_table(calibration, table, typical):
     x, y = (np.asarray(table[name], float) for name in "xy")
-    errors = [optional_column(table, name) for name in ("x_err", "y_err")]
+    errors = [numbers_or_none(table, name) for name in ("x_err", "y_err")]
     if any(error is None for error in errors):
         # Those that the solution found.
         errors = [np.full(len(x), value) for value in typical]

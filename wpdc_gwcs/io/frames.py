@@ -27,7 +27,7 @@ from wpdc_gwcs.io.companions import (
     load_weight,
     pair_companions,
 )
-from wpdc_gwcs.io.dates import header_epoch, header_start
+from wpdc_gwcs.io.dates import EXPOSURE_KEYS, header_epoch, header_start
 from wpdc_gwcs.io.exposures import camera_key, exposure_key, has_identifier
 from wpdc_gwcs.io.files import (
     READ_ERRORS,
@@ -491,7 +491,7 @@ def _facts(headers):
         if text:
             facts[fact] = text
     numbers = {
-        "exptime": positive_number(headers, ("EXPTIME", "EXPOSURE")),
+        "exptime": positive_number(headers, EXPOSURE_KEYS),
         "start": header_start(headers),
     }
     return facts | {fact: n for fact, n in numbers.items() if n is not None}

@@ -13,6 +13,7 @@ import numpy as np
 from astropy import units as u
 
 from wpdc_gwcs.exceptions import FrameError
+from wpdc_gwcs.io.dates import EXPOSURE_KEYS
 from wpdc_gwcs.io.files import READ_ERRORS, first_line, open_fits
 from wpdc_gwcs.io.headers import header_text, positive_number
 
@@ -32,7 +33,6 @@ LUMINANCE = "L"
 
 _GAIN_KEYS = ("GAIN", "EGAIN", "GAINA", "CCDGAIN", "ATODGAIN", "HIERARCH ESO DET OUT1 CONAD")
 _SATURATION_KEYS = ("SATURATE", "SATURATION", "SATURAT", "SATLEVEL", "SATURATA")
-_EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE", "TEXPTIME", "XPOSURE", "EFFEXPTM")
 
 # Spellings of units that count electrons or digital units, and of a rate.
 _ELECTRONS = re.compile(r"(e-?|el|elec|electrons?|photo-?electrons?|photons?|ph)\b", re.IGNORECASE)
@@ -181,7 +181,7 @@ def image_gain(headers):
     unit = next((t for h in headers if (t := header_text(h, "BUNIT"))), "").strip()
     if not unit:
         return gain
-    time = positive_number(headers, _EXPOSURE_KEYS) if _RATE.search(unit) else 1.0
+    time = positive_number(headers, EXPOSURE_KEYS) if _RATE.search(unit) else 1.0
     if _ELECTRONS.match(unit):
         return time
     if _COUNTS.match(unit):
