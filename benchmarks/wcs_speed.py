@@ -21,8 +21,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 
-from wpdc_gwcs import DistortionSolution
-from wpdc_gwcs.io.fits import write_cpdis
+from wpdc_gwcs import DistortionSolution, write
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 from wpdc_gwcs.wcs import build_wcs, sky_map, to_stock_wcs
 
@@ -76,7 +75,7 @@ def read_cpdis(wcs):
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "cpdis.fits")
-        write_cpdis(solution, path)
+        write(solution, path, format="cpdis")
         with fits.open(path) as hdus, warnings.catch_warnings():
             # The headers stand in a file without an image.
             warnings.simplefilter("ignore", FITSFixedWarning)

@@ -11,7 +11,7 @@ from test_mosaic import CENTERS, PLACES, SCALE, SIDE, catalog, make_frames, star
 from wpdc_gwcs import Camera, read, write
 from wpdc_gwcs.calibration import calibrate
 from wpdc_gwcs.cli.app import run as run_cli
-from wpdc_gwcs.cli.calibrate import Results, stored_solutions
+from wpdc_gwcs.cli.calibrate import stored_solutions
 from wpdc_gwcs.exceptions import InputError
 from wpdc_gwcs.models import deproject
 
@@ -25,10 +25,7 @@ def solved(stars, catalog, tmp_path_factory):
     """A run of six detectors and its files."""
     frames = make_frames(stars, EXPOSURES)
     folder = tmp_path_factory.mktemp("camera")
-    results = Results(folder, frames, overwrite=False)
-    run = calibrate(frames, catalog)
-    results.write(run)
-    return run, folder
+    return calibrate(frames, catalog, output=folder), folder
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +89,7 @@ def test_a_stored_camera_solves_detectors_of_six_stars(stars, catalog, path):
 
 def test_a_stored_camera_is_updated(stars, catalog, solved, path, tmp_path):
     frames = make_frames(stars, [((150.02, 0.02), 1.0)], seed=9)
-    run = calibrate(frames, catalog, solution=read(path), update=True)
+    run = calibrate(frames, catalog, solution=read(path), update=True, output=tmp_path)
     assert run.failures == {}
     assert not run.superseded
     for name, one in run.solutions.items():
@@ -106,7 +103,6 @@ def test_a_stored_camera_is_updated(stars, catalog, solved, path, tmp_path):
             one.statistics["learned"].keys()
             == solved[0].solutions[name].statistics["learned"].keys()
         )
-    Results(tmp_path, frames, overwrite=False).write(run)
     assert set(read(tmp_path / "CAM.camera.asdf").detectors) == set(CENTERS)
 
 

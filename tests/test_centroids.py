@@ -4,7 +4,6 @@ from astropy.table import Table
 from photutils.psf import GriddedPSFModel, ImagePSF, PSFPhotometry, SourceGrouper
 from scipy.special import erf
 
-from wpdc_gwcs import centroids, detection
 from wpdc_gwcs.centroids import _profile, build_epsf, fit_centroids, subtract_stars
 from wpdc_gwcs.detection import (
     FLAG_BLENDED,
@@ -283,10 +282,6 @@ def test_no_star_keeps_its_place_and_is_flagged(frame):
     assert np.isnan(result["chi2"][2])
     assert np.isfinite(result["x"][3])
     assert (result["flags"][[0, 1, 4]] == frame["result"]["flags"][[0, 1, 4]]).all()
-
-
-def test_flag_is_detections():
-    assert centroids._high_level._FLAG_FIT_FAILED == detection.FLAG_FIT_FAILED
 
 
 def test_too_few_stars_warn(rng):

@@ -14,6 +14,7 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.stats import mad_std
 from astropy.table import Table
+from astropy.wcs import WCS
 
 from wpdc_gwcs import read, read_catalog, read_frames
 from wpdc_gwcs.catalogs import propagate
@@ -55,8 +56,8 @@ def error_of(capsys):
 def test_calibrate_writes_what_it_promises(results, simulation):
     names = sorted(p.name for p in results.iterdir())
     assert names == [
-        "sim-01.matches.ecsv", "sim-01.wcs.asdf", "sim-02.matches.ecsv", "sim-02.wcs.asdf",
-        "sim.solution.asdf", "summary.ecsv",
+        "manifest.json", "sim-01.matches.ecsv", "sim-01.wcs.asdf", "sim-02.matches.ecsv",
+        "sim-02.wcs.asdf", "sim.solution.asdf", "summary.ecsv",
     ]  # fmt: skip
     summary = Table.read(results / "summary.ecsv")
     assert list(summary["status"]) == ["solved", "solved"]
@@ -151,6 +152,13 @@ def make_bad_files(folder, reference):
         (["{frame}", "--r0", "-5"], "r0 must be a positive number of px, got -5"),
         (["{frame}", "--n-grid", "many"], "Invalid value for '--n-grid'"),
         (["{frame}", "--holdout", "1.5"], "holdout must be between 0 and 0.9, got 1.5"),
+        (["{frame}", "--detector", "a\nb"], "--detector must be a name that can be printed"),
+        (["{frame}", "--detector", " "], "--detector must be a name that can be printed"),
+        (["{frame}", "--seed", "-1"], "seed must be an integer from 0 to .*, got -1"),
+        (["{frame}", "--threshold", "inf"], "threshold and min_snr must be finite, got inf"),
+        (["{frame}", "--scheduler-timeout", "nan"], "--scheduler-timeout must be positive"),
+        (["{frame}", "--degree", "²"], "invalid literal"),
+        (["{frame}", "--output", "/dev/null"], "/dev/null: the output folder must be writable"),
         (["{frame}", "--jobs", "0"], "--jobs must be at least 1, got 0"),
         (["{frame}", "--update"], "--update needs the stored solution"),
         (["{frame}", "--no-such-option"], "No such option"),
@@ -274,7 +282,7 @@ def test_other_commands_refuse_in_one_line(results, capsys, arguments, status, m
     assert message in error_of(capsys)
 
 
-@pytest.mark.parametrize("form", ["fits", "cpdis", "head", "sip", "stock"])
+@pytest.mark.parametrize("form", ["fits", "cpdis", "tpv", "head", "sip", "tab", "stock"])
 def test_export(results, tmp_path, capsys, form):
     out = tmp_path / f"out.{'asdf' if form == 'stock' else 'fits'}"
     command = ["export", str(results / "sim-01.wcs.asdf"), "--format", form, "--output", str(out)]
@@ -285,6 +293,48 @@ def test_export(results, tmp_path, capsys, form):
     assert "replaced only with --overwrite" in error_of(capsys)
     assert run([*command, "--overwrite", "-q"]) == 0
     assert capsys.readouterr().out == ""
+
+
+def test_matches_have_the_sky_with_errors(results):
+    """Positions of the sources scatter about the reference stars as their errors say."""
+    for name in ("sim-01", "sim-02"):
+        matches = Table.read(results / f"{name}.matches.ecsv")
+        used = np.asarray(matches["used"])
+        east = (matches["source_ra"] - matches["ra"]) * np.cos(np.radians(matches["dec"]))
+        north = matches["source_dec"] - matches["dec"]
+        for offset, error in ((east, "ra_error"), (north, "dec_error")):
+            pull = np.asarray(offset)[used] * 3.6e6 / np.asarray(matches[error])[used]
+            assert 0.8 < mad_std(pull) < 1.2
+
+
+def test_export_into_an_image(results, tmp_path, capsys):
+    file, image, copy = results / "sim-01.wcs.asdf", tmp_path / "a.fits", tmp_path / "b.fits"
+    fits.writeto(image, np.zeros((1024, 1024), np.float32))
+    before = image.read_bytes()
+    command = ["export", str(file), "--into", str(image)]
+    assert run([*command, "--output", str(copy), "--format", "sip", "--degree", "4"]) == 0
+    assert f"{copy}: written as sip (greatest deviation " in capsys.readouterr().out
+    assert image.read_bytes() == before
+    assert fits.getheader(copy)["A_ORDER"] == 4
+    assert run(command) == 0
+    out = capsys.readouterr().out
+    assert f"{image}: written as tpv (greatest deviation " in out
+    header = fits.getheader(image)
+    assert header["CTYPE1"] == "RA---TPV"
+    exact = read(file).wcs.pixel_to_world(1000.0, 1000.0)
+    worst = float(re.search(r"deviation (\S+) px", out)[1])
+    scale = np.sqrt(abs(np.linalg.det(read(file).cd)))
+    assert WCS(header).pixel_to_world(1000.0, 1000.0).separation(exact).deg < 1.1 * worst * scale
+    for wrong, message in (
+        (["--format", "head"], "--format must be one of tpv, sip, cpdis, fits, tab with --into"),
+        (["--alternates", "drop"], "--alternates must be keep or remove, got 'drop'"),
+        (["--degree", "8"], "degree must be from 1 to 7 for TPV, got 8"),
+        (["--output", str(copy)], "replaced only with --overwrite"),
+    ):
+        assert run([*command, *wrong]) == 2
+        assert message in error_of(capsys)
+    assert run(["export", str(file), "--format", "sip"]) == 2
+    assert "needs --output FILE, or --into IMAGE" in error_of(capsys)
 
 
 def test_evaluate_prints_and_writes(results, tmp_path, capsys):

@@ -1,5 +1,8 @@
+import importlib
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -30,6 +33,36 @@ def test_modules_leave_the_extras_alone(module):
 @pytest.mark.parametrize("name", wpdc_gwcs.__all__)
 def test_public_names_exist(name):
     assert getattr(wpdc_gwcs, name) is not None
+
+
+def names_of_the_api_page():
+    """What the first table of the page says can be imported from the package itself."""
+    page = Path(__file__).parents[1] / "docs" / "reference" / "api.rst"
+    table = page.read_text(encoding="utf-8").split("From frames to WCS")[0]
+    return re.findall(r"`~wpdc_gwcs\.([\w.]+)`", table)
+
+
+def test_all_names_of_the_api_page_can_be_imported():
+    names = names_of_the_api_page()
+    assert len(names) > 30
+    for name in names:
+        module, _, last = name.rpartition(".")
+        public = getattr(wpdc_gwcs, last)
+        assert public is getattr(importlib.import_module(f"wpdc_gwcs.{module}"), last)
+    documented = {name.rpartition(".")[2] for name in names}
+    assert documented == set(wpdc_gwcs.__all__) - {"__version__"}
+
+
+def test_modules_of_the_command_line_are_no_circle():
+    folder = Path(wpdc_gwcs.__file__).parent / "cli"
+    imports = {
+        path.stem: set(re.findall(r"from wpdc_gwcs\.cli\.(\w+) import", path.read_text()))
+        for path in folder.glob("*.py")
+        if path.stem != "__init__"
+    }
+    while free := [name for name, others in imports.items() if not others]:
+        imports = {n: others - set(free) for n, others in imports.items() if n not in free}
+    assert imports == {}
 
 
 def test_dir_lists_public_names():

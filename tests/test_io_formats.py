@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import warnings
+from dataclasses import replace
 
 import asdf
 import numpy as np
@@ -17,8 +18,10 @@ from numpy.polynomial import polynomial
 
 from wpdc_gwcs import build_wcs
 from wpdc_gwcs.exceptions import FileFormatError, InputError, WPDCWarning
+from wpdc_gwcs.export import FORMAT_VERSION, FORMS, make_form
 from wpdc_gwcs.io import OutputExistsError, read, read_wcs, write
-from wpdc_gwcs.io.asdf import FORMAT_VERSION
+from wpdc_gwcs.io.asdf import _loaded
+from wpdc_gwcs.io.integrity import content_sum
 from wpdc_gwcs.lookup import ResidualMap
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 from wpdc_gwcs.solution import Calibration, DistortionSolution
@@ -73,7 +76,7 @@ def make_calibration(
     return Calibration(
         frame="e00",
         solution=solution,
-        crval=np.array(crval) + 0.001,
+        crval=np.minimum(np.array(crval) + 0.001, [360.0, 90.0]),
         cd=turn @ cd,
         field=LookupTable(np.linspace(x[0], x[-1], 4), y[::4], *rng.normal(size=(2, 4, 4)) * 0.01)
         if field
@@ -189,9 +192,12 @@ def test_stock_wcs_in_the_file(tmp_path, table):
 
 
 def edited(path, tmp_path, edit):
+    """A file with other values, and a sum that agrees with them."""
     with asdf.open(path, lazy_load=False, memmap=False) as file:
-        tree = file.tree["wpdc"]
+        tree = _loaded(file.tree["wpdc"])
+        del tree["content_sum"]
         edit(tree)
+        tree["content_sum"] = content_sum(tree)
         asdf.AsdfFile({"wpdc": tree}).write_to(tmp_path / "edited.asdf")
     return tmp_path / "edited.asdf"
 
@@ -199,12 +205,15 @@ def edited(path, tmp_path, edit):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("format_version", "1.2.0", "must not be newer than 1.1.0, got 1.2.0"),
-        ("format_version", "2.0.0", "must not be newer than 1.1.0, got 2.0.0"),
-        ("format_version", "new", "must be like '1.1.0', got 'new'"),
+        ("format_version", "2.0.0", "must not be newer than 1.x, got 2.0.0"),
+        ("format_version", "new", "must be like 1.2.0, got 'new'"),
         ("kind", "map", "must be 'solution', 'calibration' or 'camera', got 'map'"),
-        ("cd", [[1.0, 2.0]], r"cd must be finite and of the shape \(2, 2\)"),
+        ("cd", [[1.0, 2.0]], r"cd must have the shape \(2, 2\)"),
+        ("cd", [[1e-4, 2e-4], [2e-4, 4e-4]], "cd must have an inverse"),
+        ("cd", "none", "damaged 'wpdc' tree"),
         ("crval", [1.0, float("nan")], "crval must be finite"),
+        ("crval", [1.0, 91.0], "crval must be RA and Dec"),
+        ("sigma", [[1.0]], r"sigma must have the shape \(3, None, None\)"),
         ("solution", None, "damaged 'wpdc' tree"),
     ],
 )
@@ -215,7 +224,7 @@ def test_bad_trees(tmp_path, calibration, key, value, message):
         read(path)
 
 
-@pytest.mark.parametrize("key", ["frame", "crval", "solution", "format_version"])
+@pytest.mark.parametrize("key", ["frame", "crval", "solution"])
 def test_missing_entries(tmp_path, calibration, key):
     write(calibration, tmp_path / "a.asdf")
     path = edited(tmp_path / "a.asdf", tmp_path, lambda tree: tree.pop(key))
@@ -279,7 +288,9 @@ def test_fits_from_the_keywords_alone(tmp_path, calibration):
     """What another writer of the keywords would give: the attitude is in the polynomial."""
     write(calibration, tmp_path / "a.fits")
     with fits.open(tmp_path / "a.fits") as hdus:
-        fits.HDUList([h for h in hdus if h.name != "WPDC_INSTRUMENT"]).writeto(tmp_path / "b.fits")
+        fits.HDUList([h for h in hdus if h.name != "WPDC_INSTRUMENT"]).writeto(
+            tmp_path / "b.fits", checksum=True
+        )
     back = read(tmp_path / "b.fits")
     assert distance(calibration, back.wcs(*grid(calibration))) < 1e-9
     np.testing.assert_array_equal(back.cd, back.solution.cd)
@@ -287,7 +298,7 @@ def test_fits_from_the_keywords_alone(tmp_path, calibration):
     # Edited keywords count, not what the table of the instrument still says.
     with fits.open(tmp_path / "a.fits") as hdus:
         hdus[0].header["PV1_0"] += 1e-4
-        hdus.writeto(tmp_path / "c.fits")
+        hdus.writeto(tmp_path / "c.fits", checksum=True)
     assert distance(calibration, read(tmp_path / "c.fits").wcs(*grid(calibration))) > 1.0
 
 
@@ -380,24 +391,150 @@ def test_cpdis_of_others_is_not_read_in_part(tmp_path, calibration):
 
 
 def test_cpdis_says_when_it_cannot(tmp_path, monkeypatch, calibration):
-    monkeypatch.setattr("wpdc_gwcs.io.fits._CPDIS_MOST_NODES", 10)
+    monkeypatch.setattr("wpdc_gwcs.export.cpdis._MOST_NODES", 10)
     with pytest.warns(WPDCWarning, match="cannot be made dense enough"):
         worst = write(calibration, tmp_path / "a.fits", format="cpdis")
     assert worst > 1e-3
 
 
-def test_head_is_ascii_and_the_pv_part(tmp_path, calibration):
+def test_head_is_ascii_and_all_of_it(tmp_path, calibration):
     calibration.settings["observer"] = "Gärtner"
     worst = write(calibration, tmp_path / "a.head")
-    assert 0.05 < worst < 1.0  # the look-up table
+    assert 0.05 < worst < 1.0  # a table as rough as noise
     text = (tmp_path / "a.head").read_bytes()
     assert text.isascii()
     lines = text.decode().splitlines()
     assert all(len(line) == 80 for line in lines)
     assert lines[-1].rstrip() == "END"
+    found = distance(calibration, read(tmp_path / "a.head").wcs(*grid(calibration)))
+    assert 0.9 * worst < found < 1.01 * worst
+    # Without a table, the polynomial is what it was.
     plain = make_calibration(table=None)
-    assert distance(plain, read(tmp_path / "a.head").wcs(*grid(plain))) < 1e-9
     assert write(plain, tmp_path / "b.head") < 1e-6
+    assert distance(plain, read(tmp_path / "b.head").wcs(*grid(plain))) < 1e-9
+
+
+def smooth_calibration(degree, *, n=2048, amplitude=40.0, seed=3):
+    """A cubic and a table that together are a polynomial of the given degree."""
+    whole = make_calibration(n=n, degree=degree, amplitude=amplitude, table=None, seed=seed)
+    solution = whole.solution
+    ny, nx = solution.image_shape
+    nodes = [np.linspace(-0.5, size - 0.5, 50) for size in (nx, ny)]
+    x, y = np.meshgrid(*nodes)
+    terms = pv_terms(3)
+    cubic = PVPolynomial.from_coefficients(
+        solution.pv.coefficients[:, : len(terms.index)], degree=3
+    )
+    offset = np.array([x.ravel(), y.ravel()]) - solution.crpix[:, None]
+    u = solution.cd @ offset
+    left = np.linalg.solve(solution.cd, np.subtract(cubic(*u), solution.pv(*u)))
+    table = LookupTable(*nodes, *left.reshape(2, *x.shape))
+    return replace(whole, solution=replace(solution, pv=cubic, lookup_table=table))
+
+
+@pytest.mark.parametrize("form", ["tpv", "head"])
+@pytest.mark.parametrize("degree", [5, 7])
+def test_tpv_has_the_whole_mapping(tmp_path, form, degree):
+    """A distortion that is a polynomial comes out as one, though it came as cubic and table."""
+    calibration = smooth_calibration(degree)
+    path = tmp_path / ("a.head" if form == "head" else "a.fits")
+    worst = write(calibration, path, format=form)
+    assert worst < (1e-3 if degree == 5 else 5e-3)  # what the spline of the table leaves
+    header = read(path)
+    assert header.solution.pv.degree == degree
+    x, y = grid(calibration, 97)
+    found = distance_at(calibration, header.wcs(x, y), x, y)
+    assert found < 1.1 * worst + 1e-9
+    # The cubic alone is off by pixels, and `fits` says so to those who do not read its table.
+    made = make_form(calibration, "fits")
+    assert made.deviation is None
+    assert made.keywords_deviation > make_form(calibration, "tpv", degree=3).deviation > 1.0
+
+
+def distance_at(calibration, sky, x, y):
+    """Greatest distance in px of other sky positions of some pixels."""
+    planes = [project(*s, calibration.crval) for s in (sky, calibration.wcs(x, y))]
+    return np.hypot(*np.linalg.solve(calibration.cd, np.subtract(*planes))).max()
+
+
+@pytest.mark.parametrize("form", ["tpv", "sip", "fits", "cpdis"])
+def test_degree_is_as_asked_for(tmp_path, form):
+    calibration = smooth_calibration(5, amplitude=10.0)
+    worst = {n: write(calibration, tmp_path / f"{n}.fits", format=form, degree=n) for n in (3, 5)}
+    header = fits.getheader(tmp_path / "5.fits")
+    if form == "sip":
+        assert header["A_ORDER"] == 5
+    else:
+        assert "PV1_22" in header
+        assert "PV1_24" not in header
+        assert "PV1_12" not in fits.getheader(tmp_path / "3.fits")
+    assert worst[5] < 1e-3
+    assert (worst[3] > 0.1) == (form in ("tpv", "sip"))
+    if form in ("fits", "cpdis"):
+        back = read(tmp_path / "5.fits").wcs(*grid(calibration))
+        assert distance(calibration, back) < 1e-3
+    for bad in (0, 10):
+        with pytest.raises(ValueError, match=f"degree must be from .* got {bad}"):
+            write(calibration, tmp_path / "b.fits", format=form, degree=bad)
+    assert not (tmp_path / "b.fits").exists()
+
+
+def test_degree_has_no_meaning_for_tables(tmp_path, calibration):
+    for form in ("tab", "stock", "asdf"):
+        with pytest.raises(ValueError, match="degree has no meaning"):
+            write(calibration, tmp_path / "a", format=form, degree=3)
+
+
+def test_reference_point_far_from_the_detector(tmp_path):
+    """As in a mosaic: the powers about it are large and cancel."""
+    calibration = make_calibration(amplitude=5.0, table="cubic")
+    solution = replace(calibration.solution, crpix=np.array([-9000.0, 12000.0]))
+    calibration = replace(calibration, solution=solution)
+    worst = write(calibration, tmp_path / "a.fits", format="tpv")
+    x, y = grid(calibration)
+    found = distance_at(calibration, read(tmp_path / "a.fits").wcs(x, y), x, y)
+    assert found < 1.05 * worst
+    assert worst < 0.5
+
+
+@pytest.mark.parametrize("crval", [(0.0001, 0.0), (200.0, -60.0)])
+@pytest.mark.parametrize("table", [None, "cubic"])
+def test_tab_is_what_wcslib_reads(tmp_path, crval, table):
+    calibration = make_calibration(crval=crval, amplitude=100.0, table=table)
+    worst = write(calibration, tmp_path / "a.fits", format="tab")
+    assert worst < 1e-3
+    wcs = astropy_wcs(tmp_path / "a.fits")
+    rng = np.random.default_rng(0)
+    ny, nx = calibration.solution.image_shape
+    x, y = rng.uniform(-0.5, nx - 0.5, 20000), rng.uniform(-0.5, ny - 0.5, 20000)
+    assert distance_at(calibration, wcs.all_pix2world(x, y, 0), x, y) < 1.1 * worst
+    back = np.array(wcs.wcs_world2pix(*wcs.wcs_pix2world(x[:50], y[:50], 0), 0))
+    np.testing.assert_allclose(back, [x[:50], y[:50]], atol=1e-4)
+
+
+def test_tab_says_that_it_has_no_pole(tmp_path):
+    calibration = make_calibration(n=256, crval=(10.0, 89.999), scale=3.0, table=None)
+    with pytest.warns(WPDCWarning, match="readers deviate by up to"):
+        assert write(calibration, tmp_path / "a.fits", format="tab") > 1.0
+
+
+@pytest.mark.parametrize("form", ["tpv", "sip", "head"])
+def test_headers_without_an_image_know_its_size(tmp_path, calibration, form):
+    """Readers such as esutil, sip_tpv and wcstools want NAXIS1 and NAXIS2."""
+    path = tmp_path / ("a.head" if form == "head" else "a.fits")
+    write(calibration, path, format=form)
+    if form == "head":
+        header = fits.Header.fromtextfile(path)
+    else:
+        with fits.open(path, checksum=True) as hdus:  # warnings are errors
+            hdus.verify("exception")
+            header = hdus[0].header.copy()
+            assert not hdus[0].data.any()
+            assert header["DATASUM"] == "0"
+        assert path.stat().st_size % 2880 == 0
+    assert [header[k] for k in ("NAXIS", "NAXIS1", "NAXIS2", "WCSAXES")] == [2, 2048, 2064, 2]
+    assert WCS(header).array_shape == (2064, 2048)
+    assert read_wcs(path).array_shape == (2064, 2048)
 
 
 def test_head_for_galsim(tmp_path):
@@ -500,7 +637,7 @@ def spoiled_fits(tmp_path, calibration, edit):
     write(calibration, tmp_path / "a.fits", overwrite=True)
     with fits.open(tmp_path / "a.fits") as hdus:
         edit(hdus)
-        hdus.writeto(tmp_path / "b.fits", overwrite=True)
+        hdus.writeto(tmp_path / "b.fits", overwrite=True, checksum=True)
     return tmp_path / "b.fits"
 
 
@@ -543,9 +680,9 @@ class TestBadFits:
 
     def test_newer_version(self, tmp_path, calibration):
         def edit(hdus):
-            hdus[0].header["WPDCVERS"] = "1.1"
+            hdus[0].header["WPDCVERS"] = "2.0"
 
-        with pytest.raises(FileFormatError, match="must not be newer than 1.0, got 1.1"):
+        with pytest.raises(FileFormatError, match="must not be newer than 1.x, got 2.0"):
             read(spoiled_fits(tmp_path, calibration, edit))
 
     @pytest.mark.parametrize("part", [0.01, 0.2, 0.7, 0.9])
@@ -608,7 +745,7 @@ def test_format_by_ending_and_by_name(tmp_path, calibration):
     assert sorted(os.listdir(tmp_path)) == ["t.ecsv"]
 
 
-@pytest.mark.parametrize("format", ["asdf", "fits", "cpdis", "head", "sip", "stock"])
+@pytest.mark.parametrize("format", ["asdf", *FORMS, "stock"])
 def test_existing_files_are_kept(tmp_path, calibration, format):
     path = tmp_path / "a.out"
     path.write_text("precious")
@@ -630,9 +767,11 @@ def test_nothing_is_left_of_a_write_that_fails(tmp_path, calibration, monkeypatc
     (tmp_path / "a.out").write_text("precious")
     target = {"asdf": "asdf.AsdfFile.write_to", "fits": "astropy.io.fits.HDUList.writeto"}[format]
 
-    def half(self, path, **options):
-        with open(path, "wb") as file:
-            file.write(b"half")
+    def half(self, target, **options):
+        if hasattr(target, "write"):
+            target.write(b"half")
+        else:
+            target.write_bytes(b"half")
         raise error
 
     monkeypatch.setattr(target, half)
@@ -641,6 +780,118 @@ def test_nothing_is_left_of_a_write_that_fails(tmp_path, calibration, monkeypatc
         write(calibration, tmp_path / "a.out", format=format, overwrite=True)
     assert os.listdir(tmp_path) == ["a.out"]
     assert (tmp_path / "a.out").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    "name", ["run#2", "a?b", "a;b", "a%41", "a\tb", "a\nb", "~", " ", "é", "*"]
+)
+@pytest.mark.parametrize("format", ["asdf", "fits", "cpdis", "head", "sip", "stock"])
+def test_names_are_names_and_nothing_else(tmp_path, calibration, format, name, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for other in ("run", "a", "aA"):
+        (tmp_path / other).write_text("precious")
+    before = set(os.listdir(tmp_path))
+    for path in (f"{name}.out", os.path.join(name, "a.out")):
+        os.makedirs(os.path.join(".", name), exist_ok=True)
+        write(calibration, path, format=format)
+        if format in ("asdf", "fits"):
+            np.testing.assert_array_equal(read(path).cd, calibration.cd)
+    assert set(os.listdir(tmp_path)) == before | {name, f"{name}.out"}
+    assert os.listdir(tmp_path / name) == ["a.out"]
+    assert all((tmp_path / other).read_text() == "precious" for other in ("run", "a", "aA"))
+
+
+def test_a_flipped_bit_is_found_or_changes_nothing(tmp_path, calibration, rng):
+    x, y = grid(calibration, n=9)
+    for name in ("a.asdf", "a.fits"):
+        write(calibration, tmp_path / name)
+        data = (tmp_path / name).read_bytes()
+        truth = read(tmp_path / name).wcs(x, y)
+        found = 0
+        for bit in rng.integers(8 * len(data), size=40):
+            bad = bytearray(data)
+            bad[bit // 8] ^= 1 << (bit % 8)
+            (tmp_path / "b").write_bytes(bad)
+            try:
+                same = read(tmp_path / "b").wcs(x, y)
+            except InputError:
+                found += 1
+            else:
+                np.testing.assert_array_equal(same, truth)
+        assert found > 10
+
+
+def test_a_table_that_astropy_leaves_out_is_missed(tmp_path, calibration):
+    write(calibration, tmp_path / "a.fits")
+    data = (tmp_path / "a.fits").read_bytes()
+    at = data.index(b"NAXIS1", data.index(b"XTENSION", data.index(b"XTENSION") + 80))
+    (tmp_path / "b.fits").write_bytes(data[: at + 31] + bytes(129) + data[at + 160 :])
+    with pytest.raises(FileFormatError, match=r"b.fits: damaged FITS file: HDU 2 cannot be read"):
+        read(tmp_path / "b.fits")
+
+
+def test_a_number_that_still_reads_as_one_is_found(tmp_path, calibration):
+    write(calibration, tmp_path / "a.asdf")
+    data = (tmp_path / "a.asdf").read_bytes()
+    for old, new in [(b"294.6", b"294.5"), (b"lookup_table", b"lookup_tabel")]:
+        assert old in data
+        (tmp_path / "b.asdf").write_bytes(data.replace(old, new))
+        with pytest.raises(FileFormatError, match="do not agree with their 'content_sum'"):
+            read(tmp_path / "b.asdf")
+
+
+@pytest.mark.parametrize("form", ["fits", "tpv", "cpdis"])
+def test_a_digit_of_a_header_of_ours_is_found(tmp_path, calibration, form):
+    write(calibration, tmp_path / "a.fits", format=form)
+    data = (tmp_path / "a.fits").read_bytes()
+    at = data.index(b".", data.index(b"CRVAL1")) + 3
+    digit = b"1" if data[at : at + 1] != b"1" else b"2"
+    (tmp_path / "b.fits").write_bytes(data[:at] + digit + data[at + 1 :])
+    with pytest.raises(FileFormatError, match="HDU 0 must agree with its CHECKSUM and DATASUM"):
+        read(tmp_path / "b.fits")
+
+
+def test_a_later_minor_version_opens(tmp_path, calibration):
+    def later(tree):
+        tree |= {"format_version": "1.99.0", "news": [1, 2]}
+
+    write(calibration, tmp_path / "a.asdf")
+    back = read(edited(tmp_path / "a.asdf", tmp_path, later))
+    np.testing.assert_array_equal(back.cd, calibration.cd)
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 12)),
+        "a: &a [*a]\n",
+        "a: [" + "0, " * 3_000_000 + "0]\n",
+        "a: " + "[" * 5000 + "]" * 5000 + "\n",
+        "- " * 5000 + "a\n",
+        "a: [1, 2\n",
+        "a: \x07\n",
+    ],
+    ids=["aliases", "itself", "long", "deep", "deep block", "open", "control character"],
+)
+def test_trees_that_stand_for_too_much(tmp_path, tree):
+    head = "#ASDF 1.0.0\n#ASDF_STANDARD 1.6.0\n%YAML 1.1\n--- \n"
+    first = "a0: &a0 [x]\n" if "a1:" in tree else ""
+    (tmp_path / "a.asdf").write_text(f"{head}{first}{tree}...\n")
+    with pytest.raises(FileFormatError, match=r"a.asdf: "):
+        read(tmp_path / "a.asdf")
+
+
+def test_blocks_that_stand_for_too_much(tmp_path):
+    """A petabyte, compressed."""
+    asdf.AsdfFile({"wpdc": np.zeros(1000)}).write_to(
+        tmp_path / "a.asdf", all_array_compression="zlib"
+    )
+    data = bytearray((tmp_path / "a.asdf").read_bytes())
+    at = data.index(b"\xd3BLK") + 6 + 8 + 16
+    data[at : at + 8] = (1 << 50).to_bytes(8)
+    (tmp_path / "a.asdf").write_bytes(data)
+    with pytest.raises(FileFormatError, match="must hold at most 4 GB, hold 1048576.0"):
+        read(tmp_path / "a.asdf")
 
 
 def test_older_files_keep_opening():

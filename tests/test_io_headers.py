@@ -24,8 +24,9 @@ from wpdc_gwcs.io.headers import (
     positive_number,
     read_headers,
 )
-from wpdc_gwcs.io.tan import fold_attitude, parse_tan
+from wpdc_gwcs.io.tan import parse_tan
 from wpdc_gwcs.models import PVPolynomial, project, pv_terms
+from wpdc_gwcs.models.attitude import fold_attitude
 
 
 def tpv_header(degree=3, *, radial=False, code="TPV", seed=0, **cards):

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.coordinates import SkyCoord
-from astropy.modeling.models import Shift
+from astropy.modeling.models import Scale, Shift
+from astropy.utils.masked import Masked
 from astropy.wcs import WCS
 from astropy.wcs.wcsapi import HighLevelWCSWrapper, SlicedLowLevelWCS
 from gwcs import coordinate_frames as cf
@@ -315,8 +316,129 @@ def test_high_level_interface():
         wcs.invert(sky)
 
 
+@pytest.mark.parametrize("box", [True, False])
+def test_masked_arrays_keep_their_mask(box):
+    wcs = camera_wcs()
+    x, y = np.array([10.0, 20.0, -99.0]), np.array([30.0, 40.0, 50.0])
+    mask = np.array([False, True, False])
+    expected = wcs(x, y, with_bounding_box=box)
+    for made in (np.ma.array, Masked):
+        both = wcs(made(x, mask=mask), y, with_bounding_box=box)
+        back = wcs.invert(made(both[0], mask=mask), both[1], with_bounding_box=box)
+        for values, plain in ((both, expected), (back, wcs.invert(*expected))):
+            assert all(isinstance(value, type(made(x, mask=mask))) for value in values)
+            assert all(value.mask.tolist() == mask.tolist() for value in values)
+            if box:
+                assert_allclose([np.asarray(v)[[0, 2]] for v in values], np.array(plain)[:, [0, 2]])
+    ra, dec = wcs(Masked(x * u.pix, mask=mask), y * u.pix)
+    assert ra.mask.tolist() == dec.mask.tolist() == mask.tolist()
+    assert_allclose(ra[0].unmasked.to_value(u.deg), expected[0][0])
+
+
+def test_repr_shows_the_parameters():
+    shown = repr(camera_wcs(crval=(120.5, 30.25)))
+    for text in ("120.5", "30.25", "pv1_7=", "4607.5", "50 x 50 nodes", "cubic"):
+        assert text in shown
+    assert "50 x 50" not in repr(camera_wcs(table=None))
+
+
+def test_axes_are_named():
+    wcs = camera_wcs()
+    assert tuple(wcs.world_axis_names) == ("ra", "dec")
+    assert tuple(to_stock_wcs(wcs).world_axis_names) == ("ra", "dec")
+
+
+def test_the_bounding_box_alone_masks(rng):
+    """Outside the nodes the WCS goes on, and so do footprints that ask half a pixel farther out."""
+    wcs = camera_wcs(roll=30.0)
+    x, y = detector_points(rng, 200)
+    x, y = (1.3 * (v - c) + c for v, c in zip((x, y), CRPIX, strict=True))
+    sky = wcs(x, y, with_bounding_box=False)
+    distortion, tangent = (step.transform for step in wcs.pipeline[:-1])
+    assert_allclose(sky, tangent(*distortion(x, y)), rtol=0, atol=1e-12)
+    assert_allclose(sky, tangent(*distortion.composed(x, y)), rtol=0, atol=1e-11)
+    assert_allclose(wcs.invert(*sky, with_bounding_box=False), (x, y), rtol=0, atol=1e-6)
+    off = (x < -0.5) | (x > NX - 0.5) | (y < -0.5) | (y > NY - 0.5)
+    assert np.isnan(wcs(x, y)[0]).tolist() == off.tolist()
+    assert np.isnan(wcs.invert(*sky)[0]).tolist() == off.tolist()
+    # No step at the rim.
+    assert_allclose(
+        wcs(-0.5 - 1e-6, 100.0, with_bounding_box=False), wcs(-0.5, 100.0), rtol=0, atol=1e-9
+    )
+    for w in (wcs, to_stock_wcs(wcs)):
+        corners = w.footprint(center=True)
+        assert np.isfinite(corners).all()
+        assert_allclose(corners, w.footprint(), rtol=0, atol=SCALE)
+
+
+def test_whole_images_may_be_larger_than_the_table():
+    wcs = camera_wcs(shape=(301, 517))
+    y, x = np.mgrid[:330, :540].astype(float)
+    expected = wcs(x, y, with_bounding_box=False)
+    assert_allclose(sky_map(wcs, image_shape=(330, 540)), expected, rtol=0, atol=1e-12)
+
+
+def test_pipelines_of_others_are_those_of_gwcs():
+    """The class adds nothing to a pipeline without our models."""
+    detector, icrs = (camera_wcs().pipeline[k].frame for k in (0, 2))
+    transform = Shift(-5.0) & Shift(3.0) | Scale(1e-3) & Scale(1e-3)
+    theirs, ours = (kind([(detector, transform), (icrs, None)]) for kind in (gwcs.WCS, DetectorWCS))
+    for wcs in (theirs, ours):
+        wcs.bounding_box = ((-0.5, 9.5), (-0.5, 19.5))
+    x, y = np.array([1.0, 15.0, 2.0]), np.array([2.0, 3.0, 50.0])
+    for a, b in (
+        (theirs(x, y), ours(x, y)),
+        (theirs.out_of_bounds((x, y)), ours.out_of_bounds((x, y))),
+        (theirs.invert(1e-3 * x, 1e-3 * y), ours.invert(1e-3 * x, 1e-3 * y)),
+    ):
+        assert_allclose(a, b)
+
+
+@pytest.mark.parametrize("v2v3", [(120.5, -496.0, 0.0), (-300.0, 20.0, 200.0), (0.0, 0.0, -75.0)])
+def test_v2v3(v2v3, rng):
+    """The frame of telescopes: their own matrix leads from it to the sky (JWST-STScI-001550)."""
+    wcs = camera_wcs(crval=(250.0, -61.0), roll=12.0)
+    distortion, sky = (step.transform for step in wcs.pipeline[:-1])
+    parts = {"crpix": CRPIX, "cd": sky.cd.value, "crval": (250.0, -61.0)}
+    parts |= {"pv": distortion.pv, "pv_cd": distortion.cd.value, "image_shape": (NY, NX)}
+    with_frame = build_wcs(**parts, lookup_table=distortion.lookup_table, v2v3=v2v3)
+    assert with_frame.available_frames == ["detector", "undistorted", "v2v3", "icrs"]
+    x, y = detector_points(rng, 200)
+    assert_allclose(with_frame(x, y), wcs(x, y), rtol=0, atol=1e-11)
+    assert_allclose(with_frame.invert(*wcs(x, y)), (x, y), rtol=0, atol=1e-5)
+    v2, v3 = np.radians(np.array(with_frame.get_transform("detector", "v2v3")(x, y)) / 3600)
+    assert_allclose(
+        np.degrees(with_frame.get_transform("undistorted", "v2v3")(*CRPIX)),
+        np.degrees(v2v3[:2]),
+        atol=1e-6,
+    )
+
+    def turn(axis, angle):
+        c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+        matrix = np.eye(3)
+        i, j = [k for k in range(3) if k != axis]
+        matrix[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
+        return matrix
+
+    # M = R3(RA) R2(-Dec) R1(-roll) R2(V3) R3(-V2), as a product of turns of axes.
+    a, b, c, d = (250.0, -61.0, v2v3[2], v2v3[1] / 3600)
+    matrix = turn(2, a) @ turn(1, b) @ turn(0, -c) @ turn(1, -d) @ turn(2, -v2v3[0] / 3600)
+    unit = np.array([np.cos(v2) * np.cos(v3), np.sin(v2) * np.cos(v3), np.sin(v3)])
+    px, py, pz = matrix @ unit
+    found = np.degrees(np.arctan2(py, px)) % 360, np.degrees(np.arcsin(pz))
+    assert_allclose(found, wcs(x, y), rtol=0, atol=1e-10)
+
+
+def test_v2v3_arguments():
+    for bad in ((1.0, 2.0), (0.0, 0.0, np.nan), (0.0, 4e5, 0.0)):
+        with pytest.raises(ValueError, match="v2v3 must be V2 and V3 in arcsec"):
+            build_wcs(crpix=(1, 1), cd=np.eye(2), crval=(0, 0), v2v3=bad)
+
+
 def test_quantities():
     wcs = camera_wcs()
+    for ra, dec in ((120.0 * u.deg, 30 * u.deg), ((120 * u.deg).to(u.rad), 108000 * u.arcsec)):
+        assert_allclose([v.to_value(u.pix) for v in wcs.invert(ra, dec)], wcs.invert(120.0, 30.0))
     ra, dec = wcs(10 * u.pix, 20 * u.pix)
     assert ra.unit == dec.unit == u.deg
     assert_allclose((ra.value, dec.value), wcs(10, 20))

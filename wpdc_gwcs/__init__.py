@@ -19,6 +19,7 @@ _PUBLIC = {
     "build_wcs": "wcs",
     "to_stock_wcs": "wcs",
     "sky_map": "wcs",
+    "fit_wcs": "conversion",
     "DistortionSolution": "solution",
     "Calibration": "solution",
     "Camera": "camera",
@@ -26,6 +27,7 @@ _PUBLIC = {
     "Settings": "calibration",
     "evaluate": "evaluation",
     "detect_drift": "evaluation",
+    "compare_weights": "evaluation",
     "read": "io",
     "read_frames": "io",
     "write": "io",
@@ -34,7 +36,9 @@ _PUBLIC = {
     "plot_lookup_table": "plotting",
     "plot_residual_arrows": "plotting",
     "plot_residual_maps": "plotting",
+    "plot_residuals_vs_magnitude": "plotting",
     "plot_residuals_vs_position": "plotting",
+    "plot_weights": "plotting",
     "write_report": "report",
 }
 

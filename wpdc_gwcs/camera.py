@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wpdc_gwcs.models import deproject, project
+from wpdc_gwcs.solution import frozen_array
 
 __all__ = ["Camera", "build_camera"]
 
@@ -58,6 +59,15 @@ class Camera:
     solutions: dict = dataclasses.field(default_factory=dict, repr=False)
     provenance: dict = dataclasses.field(default_factory=dict)
 
+    def __post_init__(self):
+        n = len(self.detectors)
+        frozen_array(self, "places", shape=(n, 2))
+        frozen_array(self, "matrices", shape=(n, 2, 2))
+        frozen_array(self, "image_shapes", shape=(n, 2), dtype=int)
+        frozen_array(self, "cd", shape=(2, 2))
+        if self.reference not in self.detectors:
+            raise ValueError(f"reference must be one of the detectors, got {self.reference!r}")
+
     def focal_plane(self, detector, x, y):
         """Focal plane position of pixels of a detector.
 
@@ -71,7 +81,7 @@ class Camera:
         Returns
         -------
         x, y : ndarray
-            Focal plane, px; NaN off the detector.
+            Focal plane, px; it goes on off the detector.
 
         Raises
         ------

@@ -15,6 +15,7 @@ __all__ = [
     "find_name",
     "listed",
     "numbers_or_nan",
+    "numbers_or_none",
     "read_numbers",
     "read_text",
     "spelled_names",
@@ -149,8 +150,8 @@ def read_numbers(column, *, several=False):
     return numbers, unreadable
 
 
-def numbers_or_nan(table, name, rows=slice(None)):
-    """Give rows of a column as floats, NaN where the table does not have it.
+def numbers_or_none(table, name, rows=slice(None)):
+    """Give rows of a column as floats, or None where the table does not have it.
 
     Parameters
     ----------
@@ -163,12 +164,29 @@ def numbers_or_nan(table, name, rows=slice(None)):
 
     Returns
     -------
-    ndarray
+    ndarray or None
+        Values, NaN where there is none.
+    """
+    return read_numbers(table[name])[0][rows] if name in table.colnames else None
+
+
+def numbers_or_nan(table, name):
+    """Give a column as floats, NaN where the table does not have it.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        Any table.
+    name : str
+        Name of the column.
+
+    Returns
+    -------
+    (N,) ndarray
         Values.
     """
-    if name not in table.colnames:
-        return np.full(len(table), np.nan)[rows]
-    return read_numbers(table[name])[0][rows]
+    values = numbers_or_none(table, name)
+    return np.full(len(table), np.nan) if values is None else values
 
 
 def unit_of(column, default=None):

@@ -12,11 +12,13 @@ __all__ = [
     "CatalogError",
     "CentroidWarning",
     "DetectionError",
+    "DuplicateFrameError",
     "FileFormatError",
     "FitError",
     "FrameError",
     "FrameFailure",
     "InputError",
+    "InternalError",
     "MatchError",
     "WPDCError",
     "WPDCWarning",
@@ -33,6 +35,10 @@ class InputError(WPDCError):
 
 class FrameError(InputError):
     """A frame (image, source list or its header) that cannot be read or has no usable WCS."""
+
+
+class DuplicateFrameError(FrameError, ValueError):
+    """Two frames of one name, which would have the same files."""
 
 
 class CatalogError(InputError):
@@ -69,6 +75,25 @@ class FitError(FrameFailure):
     def __init__(self, message="", *, reasons=None):
         super().__init__(message)
         self.reasons = reasons or {}
+
+
+class InternalError(FrameFailure):
+    """What should not happen to a frame: a mistake of the program, or a process that died.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong, in one line.
+    details : str, optional
+        Where it happened, for those who mend it.
+    """
+
+    def __init__(self, message="", details=""):
+        super().__init__(message, details)
+        self.details = details
+
+    def __str__(self):
+        return self.args[0]
 
 
 class WPDCWarning(AstropyUserWarning):

@@ -1,10 +1,14 @@
 """A frame: what one exposure of one detector brings to a calibration."""
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 __all__ = ["Frame"]
+
+# What no file name, or no table, can hold: slash, line ends and the like, bytes that are not UTF-8.
+_UNFIT = re.compile(r"[/\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class Frame:
         Returns the image as a float array ``[y, x]``; called once, when needed.
     load_sources : callable, optional
         Returns the source table (``x``, ``y`` zero based, optional ``x_err``, ``y_err``, ``flux``,
-        ``snr``, ``roundness``, ``flags``).  Exactly one of the two loaders is given.
+        ``snr``, ``roundness``, ``flags``).  Exactly one of this and ``load_image`` is given.
     gain, saturation : float, optional
         Electrons per count and saturation level in counts, from the header.
     exposure : str, optional
@@ -40,6 +44,11 @@ class Frame:
         Name of the camera, whose detectors share a focal plane; `None`: the detector is on its own.
     meta : dict
         Other facts of the header worth keeping (filter, exposure time, ...).
+    load_mask, load_weight : callable, optional
+        Return what goes with the image: an array of bool, true where a pixel must not be used, and
+        one of weights, inverse variances of the sky of any scale.
+    inputs : tuple of str, optional
+        Files besides that of ``source`` that the loaders read.
 
     Raises
     ------
@@ -69,11 +78,14 @@ class Frame:
     exposure: str | None = None
     camera: str | None = None
     meta: dict = field(default_factory=dict)
+    load_mask: Callable | None = None
+    load_weight: Callable | None = None
+    inputs: tuple[str, ...] = ()
 
     def __post_init__(self):
         if (self.load_image is None) == (self.load_sources is None):
             raise ValueError("a Frame needs exactly one of load_image and load_sources")
-        if not self.name or "/" in self.name:
+        if not self.name or _UNFIT.search(self.name):
             raise ValueError(f"name must be fit for a file name, got {self.name!r}")
         if self.epoch is not None and not math.isfinite(self.epoch):
             raise ValueError(f"epoch must be a finite Julian year or None, got {self.epoch}")

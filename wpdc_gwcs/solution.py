@@ -1,4 +1,4 @@
-"""Frozen result objects: the instrument (`DistortionSolution`), the frame (`Calibration`).
+"""Frozen results: the instrument (`DistortionSolution`), the frame (`Calibration`).
 
 ::
 
@@ -13,14 +13,77 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
+from wpdc_gwcs.export.memory import InMemory
 from wpdc_gwcs.models import LookupTable, PVPolynomial, deproject
 from wpdc_gwcs.wcs import build_wcs
 
-__all__ = ["Calibration", "DistortionSolution"]
+__all__ = ["Calibration", "DistortionSolution", "frozen_array"]
+
+# A reference point further off than this, px, is no number of any camera.
+_FARTHEST = 1e9
+# Scales of the two axes differ by less than this factor, or the matrix has no inverse worth having.
+_MOST_CONDITION = 1e6
+
+
+def frozen_array(owner, name, *, shape=None, dtype=float, finite=True):
+    """Turn an attribute of a frozen object into an array of its own that cannot be written to.
+
+    Parameters
+    ----------
+    owner : object
+        Frozen dataclass; an attribute that is `None` is left alone.
+    name : str
+        Name of the attribute.
+    shape : tuple of int or None, optional
+        Shape that it must have; `None` in it for any size.
+    dtype : type, optional
+        Type of the values.
+    finite : bool, optional
+        Whether NaN and infinity are refused.
+
+    Returns
+    -------
+    ndarray or None
+        The array.
+
+    Raises
+    ------
+    ValueError
+        If the shape or a value is not allowed.
+    """
+    value = getattr(owner, name)
+    if value is None:
+        return None
+    value = np.array(value, dtype=dtype)
+    if shape is not None and (
+        value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape))
+    ):
+        raise ValueError(f"{name} must have the shape {shape}, got {value.shape}")
+    if finite and not np.isfinite(value).all():
+        raise ValueError(f"{name} must be finite, got {value.tolist()}")
+    value.flags.writeable = False
+    object.__setattr__(owner, name, value)
+    return value
+
+
+def _freeze_pointing(owner):
+    """Freeze CRVAL and CD, and make sure that they are a place and a linear map."""
+    crval = frozen_array(owner, "crval", shape=(2,))
+    if not (abs(crval[0]) <= 360 and abs(crval[1]) <= 90):
+        raise ValueError(f"crval must be RA and Dec within 360 and 90 deg, got {crval.tolist()}")
+    cd = frozen_array(owner, "cd", shape=(2, 2))
+    if not np.linalg.cond(cd) < _MOST_CONDITION:
+        raise ValueError(f"cd must have an inverse, got {cd.tolist()}")
+
+
+def _freeze_sigma(owner, name):
+    sigma = frozen_array(owner, name, shape=(3, None, None), finite=False)
+    if sigma is not None and (min(sigma.shape[1:]) < 2 or np.any(sigma[:2] < 0)):
+        raise ValueError(f"{name} must be standard deviations on 2 x 2 nodes at least")
 
 
 @dataclass(frozen=True, eq=False)
-class DistortionSolution:
+class DistortionSolution(InMemory):
     """The distortion of one detector: what all its exposures share.
 
     Parameters
@@ -66,6 +129,24 @@ class DistortionSolution:
     provenance: dict = dataclasses.field(default_factory=dict)
     valid_from: float | None = None
     valid_to: float | None = None
+
+    def __post_init__(self):
+        crpix = frozen_array(self, "crpix", shape=(2,))
+        if np.any(np.abs(crpix) > _FARTHEST):
+            raise ValueError(f"crpix must be within {_FARTHEST:g} px, got {crpix.tolist()}")
+        _freeze_pointing(self)
+        _freeze_sigma(self, "table_sigma")
+        if self.image_shape is not None:
+            shape = tuple(int(n) for n in self.image_shape)
+            if len(shape) != 2 or min(shape) < 1 or shape != tuple(self.image_shape):
+                raise ValueError(f"image_shape must be (ny, nx), got {self.image_shape!r}")
+            object.__setattr__(self, "image_shape", shape)
+        if not np.isfinite(self.pv.coefficients).all():
+            raise ValueError("coefficients of the polynomial must be finite")
+        for name in ("valid_from", "valid_to"):
+            epoch = getattr(self, name)
+            if epoch is not None and not np.isfinite(epoch):
+                raise ValueError(f"{name} must be a Julian year or None, got {epoch}")
 
     def holds_at(self, epoch):
         """Tell whether the solution is valid at an epoch.
@@ -118,7 +199,7 @@ class DistortionSolution:
         Returns
         -------
         x, y : ndarray
-            Undistorted pixels; NaN off the detector.
+            Undistorted pixels; they go on off the detector.
         """
         return self.wcs.get_transform("detector", "undistorted")(x, y)
 
@@ -165,7 +246,7 @@ def _covariance(sigma, image_shape, x, y):
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(InMemory):
     """One calibrated frame: an instrument and the attitude of one exposure.
 
     Parameters
@@ -188,8 +269,8 @@ class Calibration:
         each axis, with X, Y in px from the reference point.
     reference_color : float, optional
         Color that the WCS is for, mag.
-    matches, sources : QTable, optional
-        Pairs and sources of the frame.
+    matches, sources : `~astropy.table.Table`, optional
+        Pairs and sources of the frame, with units.
     statistics, settings, provenance : dict
         How the calibration came about.
     """
@@ -207,6 +288,11 @@ class Calibration:
     statistics: dict = dataclasses.field(default_factory=dict)
     settings: dict = dataclasses.field(default_factory=dict)
     provenance: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        _freeze_pointing(self)
+        _freeze_sigma(self, "sigma")
+        frozen_array(self, "color_shift", shape=(2, 3))
 
     @cached_property
     def wcs(self):
@@ -249,7 +335,7 @@ class Calibration:
         Returns
         -------
         x, y : ndarray
-            Undistorted pixels; NaN off the detector.
+            Undistorted pixels; they go on off the detector.
         """
         return self.wcs.get_transform("detector", "undistorted")(x, y)
 

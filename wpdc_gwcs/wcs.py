@@ -21,11 +21,16 @@ from astropy.modeling.models import (
     Polynomial1D,
     Polynomial2D,
     RotateNative2Celestial,
+    Scale,
     Shift,
     Tabular2D,
 )
+from astropy.modeling.rotations import RotationSequence3D
+from astropy.utils.masked import Masked
 from gwcs import WCS
 from gwcs import coordinate_frames as cf
+from gwcs.geometry import CartesianToSpherical, SphericalToCartesian
+from scipy.interpolate import make_interp_spline
 
 from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, TangentSky
 from wpdc_gwcs.models.blocks import evaluate_blocks, run_blocks
@@ -85,16 +90,26 @@ class DetectorWCS(WCS):
             Coordinates in the last frame.
         """
         transform = self.forward_transform
-        plain = len(args) == 2 and not any(isinstance(value, u.Quantity) for value in args)
-        if kwargs or not plain or not isinstance(transform, DetectorToSky):
+        if kwargs or len(args) != 2 or not isinstance(transform, DetectorToSky):
             return super().__call__(
                 *args, with_bounding_box=with_bounding_box, fill_value=fill_value, **kwargs
             )
+        with_units = any(isinstance(value, u.Quantity) for value in args)
+        if with_units:
+            args = self.input_frame.remove_units(args)
         box = self.bounding_box if with_bounding_box else None
         if box is not None:
             box = box.bounding_box(order="F")
         result = evaluate_blocks(transform.block_function(box=box, fill_value=fill_value), *args)
-        return tuple(value if value.ndim else value.item() for value in result)
+        result = tuple(
+            value if value.ndim or hasattr(value, "mask") else value.item() for value in result
+        )
+        return self.output_frame.add_units(result) if with_units else result
+
+    @property
+    def _has_our_inverse(self):
+        """Whether the way back is exact, so that pixels can tell what is outside."""
+        return any(isinstance(step.transform, DistortionCorrection) for step in self.pipeline)
 
     def outside_footprint(self, world_arrays):
         """Return the positions as they are: the inverse itself tells what is outside.
@@ -107,8 +122,11 @@ class DetectorWCS(WCS):
         Returns
         -------
         world_arrays : sequence of array_like
-            The same.
+            The same; for pipelines without a `~wpdc_gwcs.models.DistortionCorrection` what gwcs
+            makes of them.
         """
+        if not self._has_our_inverse:
+            return super().outside_footprint(world_arrays)
         return world_arrays
 
     def out_of_bounds(self, pixel_arrays, fill_value=np.nan):
@@ -124,10 +142,13 @@ class DetectorWCS(WCS):
         Returns
         -------
         pixel_arrays : tuple of array_like
-            Pixel coordinates; those within 1e-6 px outside the rim are put on it.
+            Pixel coordinates; those within 1e-6 px outside the rim are put on it.  For pipelines
+            without a `~wpdc_gwcs.models.DistortionCorrection` what gwcs makes of them.
         """
+        if not self._has_our_inverse:
+            return super().out_of_bounds(pixel_arrays, fill_value=fill_value)
         limits = self.bounding_box.bounding_box(order="F")
-        values = [np.asarray(value) for value in pixel_arrays]
+        values = [getattr(value, "unmasked", np.asarray(value)) for value in pixel_arrays]
         if all(
             value.size and value.min() >= low and value.max() <= high
             for value, (low, high) in zip(values, limits, strict=True)
@@ -139,10 +160,18 @@ class DetectorWCS(WCS):
             near = np.clip(values[k], low, high)
             values[k] = np.where(np.abs(near - values[k]) <= _RIM_PX, near, values[k])
             outside = outside | ~((values[k] >= low) & (values[k] <= high))
-        return tuple(np.where(outside, fill_value, value)[()] for value in values)
+        values = [np.where(outside, fill_value, value)[()] for value in values]
+        for k, given in enumerate(pixel_arrays):
+            if isinstance(given, np.ma.MaskedArray):
+                values[k] = np.ma.array(values[k], mask=given.mask)
+            elif hasattr(given, "mask"):
+                values[k] = Masked(values[k], mask=given.mask)
+        return tuple(values)
 
 
-def build_wcs(*, crpix, cd, crval, pv=None, pv_cd=None, lookup_table=None, image_shape=None):
+def build_wcs(
+    *, crpix, cd, crval, pv=None, pv_cd=None, lookup_table=None, image_shape=None, v2v3=None
+):
     """Build the WCS of a detector from its distortion and attitude.
 
     Parameters
@@ -161,11 +190,17 @@ def build_wcs(*, crpix, cd, crval, pv=None, pv_cd=None, lookup_table=None, image
         Subtracted after the polynomial.
     image_shape : (int, int), optional
         Shape of the detector, (ny, nx).  The bounding box then covers all of it, -0.5 ... n - 0.5.
+    v2v3 : (float, float, float), optional
+        V2 and V3 of the reference point in arcseconds, and the position angle of the V3 axis there
+        (north through east) in degrees, as ``v2_ref``, ``v3_ref``, ``roll_ref`` of JWST and Roman.
+        The WCS then has the frame ``v2v3``, in arcseconds, in front of ``icrs``, where the
+        correctors of tweakwcs and stcal put theirs.
 
     Returns
     -------
     wcs : DetectorWCS
-        A `gwcs.WCS` with the frames ``detector``, ``undistorted`` and ``icrs``.
+        A `gwcs.WCS` with the frames ``detector``, ``undistorted``, ``icrs``, with ``v2v3`` before
+        the last one where it is asked for.
 
     Raises
     ------
@@ -197,9 +232,53 @@ def build_wcs(*, crpix, cd, crval, pv=None, pv_cd=None, lookup_table=None, image
         crval = (crval.icrs.ra.deg, crval.icrs.dec.deg)
     distortion = DistortionCorrection(crpix, cd if pv_cd is None else pv_cd, pv, lookup_table)
     sky = TangentSky(crpix, cd, crval)
-    wcs = DetectorWCS(_steps(distortion, sky))
+    steps = _steps(distortion, sky)
+    if v2v3 is not None:
+        (undistorted, _), (icrs, _) = steps[1:]
+        steps[1:] = [*_v2v3_steps(undistorted, sky, v2v3), (icrs, None)]
+    wcs = DetectorWCS(steps)
     _set_shape(wcs, image_shape)
     return wcs
+
+
+def _v2v3_steps(undistorted, sky, v2v3):
+    """Return the steps from undistorted pixels over the frame v2v3 to the sky."""
+    v2v3 = np.array(v2v3, dtype=float)
+    if v2v3.shape != (3,) or not np.all(np.isfinite(v2v3)) or abs(v2v3[1]) >= 90 * 3600:
+        raise ValueError(
+            "v2v3 must be V2 and V3 in arcsec, V3 within a quarter of a circle, and an angle in "
+            f"deg, not {v2v3.tolist()}"
+        )
+    v2, v3, roll = v2v3 / (3600, 3600, 1)
+    c, s = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    along_v2v3 = np.array([[c, -s], [s, c]])
+    crpix, (ra, dec) = sky.crpix.value, sky.crval.value
+    to_v2v3 = (
+        Shift(-crpix[0]) & Shift(-crpix[1])
+        | AffineTransformation2D(along_v2v3 @ sky.cd.value, translation=[0.0, 0.0])
+        | Pix2Sky_TAN()
+        | RotateNative2Celestial(v2, v3, 180.0)
+        # For V2 on both sides of zero.
+        | SphericalToCartesian(wrap_lon_at=360)
+        | CartesianToSpherical(wrap_lon_at=180)
+        | Scale(3600.0) & Scale(3600.0)
+    )
+    # Not by way of native latitudes: an arc sine near 90 degrees has no more than eight digits.
+    to_sky = (
+        Scale(1 / 3600) & Scale(1 / 3600)
+        | SphericalToCartesian(wrap_lon_at=180)
+        | RotationSequence3D([v2, -v3, roll, dec, -ra], "zyxyz")
+        | CartesianToSpherical(wrap_lon_at=360)
+    )
+    to_v2v3.name, to_sky.name = "undistorted_to_v2v3", "v2v3_to_sky"
+    frame = cf.Frame2D(
+        name="v2v3",
+        axes_order=(0, 1),
+        axes_names=("v2", "v3"),
+        axes_type=("SPATIAL", "SPATIAL"),
+        unit=(u.arcsec, u.arcsec),
+    )
+    return [(undistorted, to_v2v3), (frame, to_sky)]
 
 
 def _steps(distortion, sky):
@@ -208,7 +287,12 @@ def _steps(distortion, sky):
     undistorted = cf.Frame2D(
         name="undistorted", axes_names=("x_undistorted", "y_undistorted"), **pixel_axes
     )
-    icrs = cf.CelestialFrame(name="icrs", reference_frame=coord.ICRS(), unit=(u.deg, u.deg))
+    icrs = cf.CelestialFrame(
+        name="icrs",
+        reference_frame=coord.ICRS(),
+        axes_names=("ra", "dec"),
+        unit=(u.deg, u.deg),
+    )
     return [(detector, distortion), (undistorted, sky), (icrs, None)]
 
 
@@ -410,7 +494,24 @@ def _stock_distortion(distortion):
     table = distortion.lookup_table
     if table is None:
         return model
-    return model - _stock_table(table.x_grid, table.y_grid, (table.dx, table.dy), table.method)
+    return model - _stock_table(*_with_outer_nodes(table), table.method)
+
+
+def _with_outer_nodes(table):
+    """Return grids and values of a table with one more node at every end.
+
+    Stock tables have no values outside their nodes, and what needs the corners of an image asks for
+    some half a pixel outside.  Of a spline without knots next to its ends the outer cubics go on to
+    the new nodes, and the spline through all of them is the same.
+    """
+    degree = 3 if table.method == "cubic" else 1
+    grids, values = [], np.array([table.dx, table.dy])
+    for grid, axis in ((table.x_grid, 2), (table.y_grid, 1)):
+        step = (grid[-1] - grid[0]) / (len(grid) - 1)
+        wider = np.concatenate([[grid[0] - step], grid, [grid[-1] + step]])
+        values = make_interp_spline(grid, values, k=degree, axis=axis)(wider)
+        grids.append(wider)
+    return *grids, values
 
 
 def _stock_table(x_grid, y_grid, values, method):
@@ -476,7 +577,7 @@ def _stock_inverse(distortion, image_shape):
         x, y = (v.ravel() for v in np.meshgrid(x_nodes, y_nodes))
         # Where the polynomial takes which image to this node, and which pixel has that image.
         image = approximate.invert(x, y, tolerance=1e-10)
-        pixel = plane_map.invert(*image, tolerance=1e-10, margin=3 * margin)
+        pixel = plane_map.invert(*image, tolerance=1e-10)
         left = np.subtract(pixel, (x, y)).reshape(2, n_nodes, n_nodes)
         if not np.all(np.isfinite(left)):
             return None

@@ -13,7 +13,8 @@ together, because they share its detectors and exposures (`solve_camera`).
 """
 
 from wpdc_gwcs.calibration.camera import solve_camera
-from wpdc_gwcs.calibration.matched import MatchedFrame, match_frame, measure_sources
+from wpdc_gwcs.calibration.matched import MatchedFrame, match_frame
+from wpdc_gwcs.calibration.measure import measure_sources
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.run import CalibrationRun, calibrate
 from wpdc_gwcs.calibration.settings import Settings

@@ -7,16 +7,17 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 
 import numpy as np
-from astropy.table import QTable
+from astropy.table import Table
 
 from wpdc_gwcs.calibration.checks import check_solution, shortcomings
-from wpdc_gwcs.calibration.matched import optional_column
+from wpdc_gwcs.calibration.positions import with_sky_positions
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import (
     LinearWCS,
     detector_center,
     header_reference_point,
 )
+from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.evaluation import evaluate
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.fitting import MIN_STARS_ATTITUDE, fit_attitude
@@ -33,6 +34,12 @@ log = logging.getLogger(__name__)
 _MAX_REMATCH = 3
 _SETTLED = 0.01
 _REMATCH_SIGMAS = 5.0
+
+# Columns of matches, which are plain arrays with units: residuals are computed with.
+_UNITS = {
+    **dict.fromkeys(("x", "y", "x_err", "y_err", "dx", "dy"), "pix"),
+    **dict.fromkeys(("ra", "dec"), "deg"),
+}
 
 
 def cameras_of(frames):
@@ -345,7 +352,7 @@ def _exposure(frame, pairs, attitude, holdout):
         crval=attitude.crval,
         cd=attitude.cd,
         use=use,
-        color=optional_column(ref, "bp_rp"),
+        color=numbers_or_none(ref, "bp_rp"),
         detector=frame.detector,
         exposure=_exposure_key(frame),
     )
@@ -353,11 +360,11 @@ def _exposure(frame, pairs, attitude, holdout):
 
 def _position_errors(src, ref, cd):
     """Errors of pairs in px, centroid and reference star together; None where there are none."""
-    x_err, y_err = optional_column(src, "x_err"), optional_column(src, "y_err")
+    x_err, y_err = numbers_or_none(src, "x_err"), numbers_or_none(src, "y_err")
     if x_err is None or y_err is None:
         return None, None
     scale = np.sqrt(abs(np.linalg.det(cd))) * 3.6e6  # mas / px
-    errors = [optional_column(ref, name) for name in ("ra_error", "dec_error")]
+    errors = [numbers_or_none(ref, name) for name in ("ra_error", "dec_error")]
     if any(e is None for e in errors):
         return x_err, y_err
     # Small beside those of the centroids: the mean of both axes serves at any roll.
@@ -375,7 +382,7 @@ def _rematch(frame, pairs, calibration, fit):
     # The errors of the pairs say how far apart a star and its source can be.
     sigma = np.sqrt(0.5 * (fit.x_err**2 + fit.y_err**2))
     typical = np.nanmedian(sigma[fit.used])
-    x_err, y_err = optional_column(src, "x_err"), optional_column(src, "y_err")
+    x_err, y_err = numbers_or_none(src, "x_err"), numbers_or_none(src, "y_err")
     if x_err is None or y_err is None:
         each = np.full(len(src), typical)
     else:
@@ -405,7 +412,7 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
     src, ref = frame.sources[i_src], frame.reference[i_ref]
     catalog_index = np.asarray(ref["catalog_index"])
     held = np.zeros(len(src), bool) if holdout is None else holdout[catalog_index]
-    matches = QTable(
+    matches = Table(
         {
             "source_index": i_src.astype(np.int64),
             "catalog_index": catalog_index.astype(np.int64),
@@ -421,10 +428,13 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
             "holdout": held,
         }
     )
+    for name in matches.colnames:
+        matches[name].unit = _UNITS.get(name)
     # Not of use here, but to see whether residuals depend on them.
     for table, name in ((src, "snr"), (ref, "phot_g_mean_mag"), (ref, "bp_rp")):
         if name in table.colnames:
-            matches[name] = optional_column(table, name)
+            matches[name] = numbers_or_none(table, name)
+            matches[name].unit = table[name].unit
     residuals = evaluate(fit.dx[fit.used], fit.dy[fit.used])
     scale = np.sqrt(abs(np.linalg.det(fit.cd))) * 3.6e6
     statistics = {
@@ -453,7 +463,7 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
     reasons = shortcomings(frame, calibration, held=held, known=known, stored=stored)
     statistics["status"] = "degraded" if reasons else "solved"
     statistics["reasons"] = reasons
-    return calibration
+    return with_sky_positions(calibration)
 
 
 def _provenance(group, before=None):

@@ -1,4 +1,4 @@
-"""One frame, measured on its image and matched to the reference catalogue."""
+"""One frame, matched to the reference catalogue."""
 
 import logging
 import time
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.table import Table
 
+from wpdc_gwcs.calibration.measure import measure_sources, rules_of
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import (
     LinearWCS,
@@ -15,18 +16,17 @@ from wpdc_gwcs.calibration.start import (
     linear_wcs,
     sky_of,
 )
-from wpdc_gwcs.catalogs import fill_motions, propagate, select_cone
-from wpdc_gwcs.centroids import build_epsf, fit_centroids, subtract_stars
-from wpdc_gwcs.detection import detect_companions, detect_sources, subtract_background
-from wpdc_gwcs.exceptions import DetectionError, MatchError, WPDCError
+from wpdc_gwcs.catalogs import fill_motions, propagate, read_catalog, select_cone
+from wpdc_gwcs.columns import numbers_or_none
+from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
+from wpdc_gwcs.selection import left_out
 
 __all__ = [
     "FailedFrame",
     "MatchedFrame",
+    "catalog_of_frame",
     "match_frame",
-    "measure_sources",
-    "optional_column",
     "reference_in_reach",
     "usable_sources",
     "with_errors",
@@ -34,15 +34,10 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 
-# Stars kept for matching and fitting (the paper's section 3.1): rounder than galaxies, and well
-# measured.
-_MAX_ROUNDNESS = 0.3
-_MIN_SNR = 10.0
-
 _ERROR_FLOOR = 0.01  # px
 
-# Rounds after which close pairs have shared out their light.
-_PASSES_OF_PAIRS = 6
+# Scales of the two axes of a header that differ by more are no scales.
+_MOST_CONDITION = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,84 +77,6 @@ class FailedFrame:
     sources: Table | None = None
 
 
-def measure_sources(frame, settings=None):
-    """Source table of a frame: measured on its image, or read from its source list.
-
-    Parameters
-    ----------
-    frame : Frame
-        Image or source list.
-    settings : Settings, optional
-        ``centroids``, ``threshold`` and ``min_snr`` are used.
-
-    Returns
-    -------
-    `~astropy.table.Table`
-        Columns ``x``, ``y`` (px, zero based) and what else was measured.
-
-    Raises
-    ------
-    DetectionError
-        If there are no stars on the image, or no rows in the list.
-
-    Notes
-    -----
-    Fainter stars than ``min_snr`` are measured with the others, whose light they disturb, and left
-    out at the end.
-    """
-    settings = Settings() if settings is None else settings
-    if frame.load_sources is not None:
-        sources = frame.load_sources()
-        if len(sources) == 0:
-            raise DetectionError(f"{frame.source}: the source list has no rows")
-        return sources
-    if settings.centroids == "given":
-        raise DetectionError(
-            f"{frame.source}: centroids 'given' needs a source list, and this is an image"
-        )
-    image = frame.load_image()
-    background = subtract_background(image)
-    detected = detect_sources(
-        background,
-        threshold=settings.threshold,
-        gain=frame.gain,
-        saturation=frame.saturation,
-    )
-    sources = detected
-    if settings.centroids == "psf":
-        detected, sources = _fit_psf(background, detected, frame.gain, settings.threshold)
-    if settings.min_snr == 0:
-        return sources
-    # The fit's own ratio is the greater one, but for sources whose aperture is full of others.
-    snr = np.minimum(detected["flux"] / detected["flux_err"], sources["snr"])
-    if not np.any(snr > settings.min_snr):
-        raise DetectionError(
-            f"{frame.source}: none of {len(sources)} sources has a signal-to-noise ratio above "
-            f"{settings.min_snr:g}"
-        )
-    return sources[snr > settings.min_snr]
-
-
-def _fit_psf(background, detected, gain, threshold):
-    """Fit the PSF to all sources and to what shows once they are subtracted.
-
-    Returns the sources as they were detected, companions included, and as they were fitted; both
-    are the same where no PSF could be built.
-    """
-    epsf = build_epsf(background, detected, gain=gain)
-    if epsf is None:
-        return detected, detected
-    fitted = fit_centroids(background, detected, epsf, gain=gain)
-    residual = subtract_stars(background, fitted, epsf, gain=gain)
-    detected = detect_companions(residual, detected, threshold=threshold, gain=gain)
-    start = detected.copy()
-    for name in ("x", "y", "flux"):
-        start[name][: len(fitted)] = fitted[name]
-    return detected, fit_centroids(
-        background, start, epsf, gain=gain, refit=True, passes=_PASSES_OF_PAIRS
-    )
-
-
 def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     """Measure one frame and match it to the reference catalogue.
 
@@ -167,8 +84,8 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     ----------
     frame : Frame
         Image or source list.
-    catalog : `~astropy.table.Table`
-        Reference catalogue as returned by `read_catalog`.
+    catalog : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
+        Reference catalogue: what `read_catalog` takes, or has returned.
     settings : Settings, optional
         Choices; the defaults work for any camera.
     sources : `~astropy.table.Table`, optional
@@ -188,32 +105,36 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     """
     settings = Settings() if settings is None else settings
     began = time.perf_counter()
+    if "catalog_index" not in getattr(catalog, "colnames", ()):
+        catalog = read_catalog(catalog)
     if sources is None:
         sources = measure_sources(frame, settings)
     sources = with_errors(sources)
-    usable = usable_sources(sources, frame.image_shape)
+    usable = usable_sources(sources, frame, settings)
     x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)
+    start = _start(frame, solution)
     if solution is None:
-        start = linear_wcs(frame.wcs, header_reference_point(frame))
         xs, ys = start.pixels(*sky_of(frame.wcs, x, y))
     else:
-        start = linear_wcs(frame.wcs, solution.crpix)
         xs, ys = solution.undistort(x, y)
     reference = reference_in_reach(frame, catalog, start, settings)
     xr, yr = start.pixels(np.asarray(reference["ra"]), np.asarray(reference["dec"]))
     pick = np.flatnonzero(usable & np.isfinite(xs) & np.isfinite(ys))
-    i_src, i_ref, diagnostics = match_planes(
-        xs[pick],
-        ys[pick],
-        xr,
-        yr,
-        flux=optional_column(sources, "flux", pick),
-        mag=optional_column(reference, "phot_g_mean_mag"),
-        x_err=optional_column(sources, "x_err", pick),
-        y_err=optional_column(sources, "y_err", pick),
-        image_shape=frame.image_shape,
-        blind=settings.blind,
-    )
+    try:
+        i_src, i_ref, diagnostics = match_planes(
+            xs[pick],
+            ys[pick],
+            xr,
+            yr,
+            flux=numbers_or_none(sources, "flux", pick),
+            mag=numbers_or_none(reference, "phot_g_mean_mag"),
+            x_err=numbers_or_none(sources, "x_err", pick),
+            y_err=numbers_or_none(sources, "y_err", pick),
+            image_shape=frame.image_shape,
+            blind=settings.blind,
+        )
+    except MatchError as err:
+        raise MatchError(f"{err} ({left_out(rules_of(sources, frame, settings))})") from err
     log.info("%s: %d of %d sources matched", frame.name, len(i_src), len(sources))
     return MatchedFrame(
         name=frame.name,
@@ -235,26 +156,6 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     )
 
 
-def optional_column(table, name, rows=slice(None)):
-    """Rows of a column as floats, or None where the table does not have it.
-
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        Any table.
-    name : str
-        Name of the column.
-    rows : slice or array_like, optional
-        Rows; default all.
-
-    Returns
-    -------
-    ndarray or None
-        Values.
-    """
-    return np.asarray(table[name], dtype=float)[rows] if name in table.colnames else None
-
-
 def with_errors(sources):
     """Add errors by signal-to-noise where a list has none; their scale is fitted later.
 
@@ -272,37 +173,73 @@ def with_errors(sources):
         return sources
     sources = sources.copy()
     # A star of FWHM 2.4 px has a centroid error of 1 / snr px, and no centroid is perfect.
-    error = np.hypot(1.0 / np.maximum(np.asarray(sources["snr"], float), 1.0), _ERROR_FLOOR)
+    error = np.hypot(1.0 / np.maximum(numbers_or_none(sources, "snr"), 1.0), _ERROR_FLOOR)
     sources["x_err"] = sources["y_err"] = error
     return sources
 
 
-def usable_sources(sources, image_shape):
-    """Mark the sources that may enter the match: clean, round, well measured, on the detector.
+def usable_sources(sources, frame, settings):
+    """Mark the sources that may enter the match.
 
     Parameters
     ----------
     sources : `~astropy.table.Table`
         What was measured.
-    image_shape : (int, int)
-        Shape ``(ny, nx)`` of the detector.
+    frame : Frame
+        Its shape counts.
+    settings : Settings
+        ``max_roundness`` and ``min_snr`` are used.
 
     Returns
     -------
     (N,) ndarray of bool
-        Mask over the sources.
+        Mask over the sources, see `wpdc_gwcs.matching.select_sources`.
     """
-    ny, nx = image_shape
-    x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)
-    with np.errstate(invalid="ignore"):
-        usable = (x >= -0.5) & (x <= nx - 0.5) & (y >= -0.5) & (y <= ny - 0.5)
-        if "flags" in sources.colnames:
-            usable &= np.asarray(sources["flags"]) == 0
-        if "roundness" in sources.colnames:
-            usable &= np.abs(np.asarray(sources["roundness"], float)) <= _MAX_ROUNDNESS
-        if "snr" in sources.colnames:
-            usable &= np.asarray(sources["snr"], float) > _MIN_SNR
-    return usable
+    return ~np.any(list(rules_of(sources, frame, settings).values()), axis=0)
+
+
+def _start(frame, solution):
+    """Linear WCS about which a frame is matched."""
+    point = header_reference_point(frame) if solution is None else solution.crpix
+    start = linear_wcs(frame.wcs, point)
+    if not np.linalg.cond(start.cd) < _MOST_CONDITION:
+        raise MatchError(
+            f"{frame.source}: the starting WCS must be invertible, its matrix is "
+            f"{start.cd.tolist()} deg / px at pixel {point.tolist()}"
+        )
+    return start
+
+
+def _reach(frame, start, settings):
+    """Center and radius, deg, of the sky in which a match of the frame is sought."""
+    ny, nx = frame.image_shape
+    center = detector_center(frame.image_shape)
+    ra, dec = (float(c) for c in np.ravel(sky_of(frame.wcs, *center[:, None])))
+    # As wide as the match searches, see `match_planes`.
+    margin = max(nx, ny) * (0.5 if settings.blind else 0.2) + 500
+    return ra, dec, (np.hypot(nx, ny) / 2 + margin) * start.scale
+
+
+def catalog_of_frame(frame, catalog, settings, *, solution=None):
+    """Cut the reference catalogue to what a frame can need, to be handed to another process.
+
+    Parameters
+    ----------
+    frame : Frame
+        Its WCS tells where.
+    catalog : `~astropy.table.Table`
+        Reference catalogue whose motions have been filled.
+    settings : Settings
+        A blind search needs more.
+    solution : DistortionSolution, optional
+        Stored solution of the detector.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        Rows of the catalogue, from which `match_frame` selects the same stars as from all.
+    """
+    return select_cone(catalog, *_reach(frame, _start(frame, solution), settings))
 
 
 def reference_in_reach(frame, catalog, start, settings):
@@ -329,14 +266,11 @@ def reference_in_reach(frame, catalog, start, settings):
     MatchError
         If there are none.
     """
-    ny, nx = frame.image_shape
-    center = detector_center(frame.image_shape)
-    ra, dec = (float(c) for c in np.ravel(sky_of(frame.wcs, *center[:, None])))
-    # As wide as the match searches, see `match_planes`.
-    margin = max(nx, ny) * (0.5 if settings.blind else 0.2) + 500
-    radius = (np.hypot(nx, ny) / 2 + margin) * start.scale
+    ra, dec, radius = _reach(frame, start, settings)
     # Before the cut, which would take neighbours away; in a run it has been done for all frames.
     near = select_cone(fill_motions(catalog), ra, dec, radius)
+    if settings.max_mag is not None and "phot_g_mean_mag" in near.colnames:
+        near = near[~(np.asarray(near["phot_g_mean_mag"], float) > settings.max_mag)]
     if len(near) == 0:
         raise MatchError(
             f"{frame.source}: the catalogue has no star within {radius:.3f} deg of the frame's "

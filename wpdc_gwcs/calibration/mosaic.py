@@ -23,13 +23,13 @@ from wpdc_gwcs.calibration.geometry import LocalPairs, fit_geometry
 from wpdc_gwcs.calibration.matched import (
     FailedFrame,
     MatchedFrame,
-    optional_column,
     reference_in_reach,
     usable_sources,
     with_errors,
 )
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs, sky_of
+from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching import SmoothMap, match_nearby, match_planes
 from wpdc_gwcs.threads import one_blas_thread
@@ -145,7 +145,10 @@ def _solve(plane, results, catalog, settings, solution):
                 continue
             if prediction.shift <= _NARROWER * tried.get(name, np.inf):
                 tried[name] = prediction.shift
-                new[name] = _task(plane.frames[name], failed[name], solution), prediction
+                new[name] = (
+                    _task(plane.frames[name], failed[name], solution, settings),
+                    prediction,
+                )
         found = _match_all(new, catalog, settings)
         for name in found:
             log.info("%s: matched from its neighbors", name)
@@ -233,12 +236,12 @@ def _contradicted(plane, geometry, matched, known):
     return min(disagreement, key=disagreement.get)
 
 
-def _task(frame, result, solution):
+def _task(frame, result, solution, settings):
     sources = with_errors(result.sources)
     if isinstance(solution, Mapping):
         solution = solution.get(frame.detector)
     crpix = header_reference_point(frame) if solution is None else np.asarray(solution.crpix)
-    return _Task(frame, sources, usable_sources(sources, frame.image_shape), crpix)
+    return _Task(frame, sources, usable_sources(sources, frame, settings), crpix)
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,8 +291,8 @@ def _stars(task, prediction, catalog, settings):
         xs[pick],
         ys[pick],
         *start.pixels(reference["ra"], reference["dec"]),
-        optional_column(task.sources, "flux", pick),
-        optional_column(reference, "phot_g_mean_mag"),
+        numbers_or_none(task.sources, "flux", pick),
+        numbers_or_none(reference, "phot_g_mean_mag"),
     )
 
 
@@ -367,8 +370,8 @@ def _match(task, prediction, catalog, settings, **search):
                 *start.pixels(stars.reference["ra"], stars.reference["dec"]),
                 flux=stars.flux,
                 mag=stars.mag,
-                x_err=optional_column(sources, "x_err", stars.pick),
-                y_err=optional_column(sources, "y_err", stars.pick),
+                x_err=numbers_or_none(sources, "x_err", stars.pick),
+                y_err=numbers_or_none(sources, "y_err", stars.pick),
                 image_shape=frame.image_shape,
                 start=SmoothMap.identity(frame.image_shape),
             )

@@ -1,28 +1,35 @@
 """A whole run: every frame matched, every detector solved, one summary."""
 
-import time
+import itertools
+import logging
+import os
+import uuid
 from collections import Counter
-from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
-from multiprocessing import get_context
 
 import numpy as np
 from astropy.table import QTable, Table
 
 from wpdc_gwcs.calibration.camera import cameras_of, solve_camera
 from wpdc_gwcs.calibration.exposures import tie_exposures
-from wpdc_gwcs.calibration.matched import FailedFrame, match_frame, measure_sources
+from wpdc_gwcs.calibration.manifest import plan_run
+from wpdc_gwcs.calibration.matched import FailedFrame
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
+from wpdc_gwcs.calibration.results import Outcome, ResultFolder
 from wpdc_gwcs.calibration.settings import Settings
+from wpdc_gwcs.calibration.summary import summarize, summary_row
+from wpdc_gwcs.calibration.workers import Task, Workers, internal_error, stored_of
 from wpdc_gwcs.camera import build_camera
-from wpdc_gwcs.catalogs import fill_motions
-from wpdc_gwcs.exceptions import FitError, MatchError, WPDCError
+from wpdc_gwcs.catalogs import fill_motions, read_catalog, split_extension
+from wpdc_gwcs.exceptions import DuplicateFrameError, FitError, InternalError, MatchError, WPDCError
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["CalibrationRun", "calibrate"]
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +50,10 @@ class CalibrationRun:
         Detector name to the stored solution that an update has found changed, valid until then.
     cameras : list of `Camera`
         One for each group of detectors that were solved together.
+    run_id : str
+        Identity of the run, which all files carry that it writes.
+    resumed : tuple of str
+        Frames that an earlier run had done, whose results were read from its files.
     """
 
     calibrations: list
@@ -51,6 +62,8 @@ class CalibrationRun:
     summary: QTable = field(repr=False)
     superseded: dict = field(default_factory=dict)
     cameras: list = field(default_factory=list)
+    run_id: str = ""
+    resumed: tuple = ()
 
 
 @one_blas_thread
@@ -63,16 +76,19 @@ def calibrate(
     settings=None,
     jobs=1,
     executor=None,
+    output=None,
+    overwrite=False,
+    resume=False,
     progress=None,
 ):
     """Calibrate frames against a reference catalogue.
 
     Parameters
     ----------
-    frames : Frame or sequence of Frame
+    frames : Frame or iterable of Frame
         What `wpdc_gwcs.io.read_frames` returns; names must be unique.
-    catalog : `~astropy.table.Table`
-        Reference catalogue as returned by `read_catalog`.
+    catalog : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
+        Reference catalogue: whatever `read_catalog` takes, and what it returned.
     solution : DistortionSolution, Camera or mapping, optional
         Stored solution (of a camera, or detector name to solution): only the attitudes of the
         frames are fitted.
@@ -85,7 +101,16 @@ def calibrate(
         Processes in which frames are measured and matched.
     executor : concurrent.futures.Executor, optional
         Where frames are measured and matched instead, for example
-        ``dask.distributed.Client(...).get_executor()``.
+        ``dask.distributed.Client(...).get_executor()``.  With each frame goes the part of the
+        catalogue that it can need, and no more.
+    output : path-like, optional
+        Folder into which all results are written, made if needed; those of a detector as soon as
+        it is solved.
+    overwrite : bool, optional
+        Replace files that are there.
+    resume : bool, optional
+        Leave out what a run of the same frames, catalogue, settings and versions has written into
+        the folder already, and go on with it.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` while the run goes on.
 
@@ -96,8 +121,13 @@ def calibrate(
 
     Raises
     ------
+    DuplicateFrameError
+        If two frames have the same name.
     ValueError
-        If two frames have the same name, or there is none.
+        If there is no frame.
+    InputError
+        If the catalogue cannot be used, a file cannot be written or may not be replaced, or a run
+        of other choices is to be resumed.
 
     Warns
     -----
@@ -108,54 +138,178 @@ def calibrate(
     ----------
     WPDC-2P, arXiv:2603.09193.
     """
-    frames = list(frames) if isinstance(frames, (list, tuple)) else [frames]
+    frames = _as_frames(frames)
     settings = Settings() if settings is None else settings
-    if not frames:
-        raise ValueError("calibrate needs at least one frame")
-    names = [frame.name for frame in frames]
-    if len(set(names)) < len(names):
-        twice = sorted({n for n in names if names.count(n) > 1})
-        raise ValueError(f"frame names must be unique, got twice: {', '.join(twice)}")
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {jobs}")
+    if resume and output is None:
+        raise ValueError("resume needs the output folder of the run that is resumed")
     progress = progress or (lambda stage, done, total: None)
-    # Once and from the whole catalogue: a star moves alike in all frames.
-    catalog = fill_motions(catalog)
-    frames = _named_apart(tie_exposures(frames)) if solution is None else tie_exposures(frames)
-
     solution = getattr(solution, "solutions", solution)
-    common = {"catalog": catalog, "solution": solution, "settings": settings}
-    results = _of_other_detectors(frames, solution)
-    if not results:
-        results = _match_exposures(frames, common, jobs, executor, progress)
-    failures = {n: r.error for n, r in results.items() if isinstance(r, FailedFrame)}
-    matched = [r for r in results.values() if not isinstance(r, FailedFrame)]
+    frames = _named_apart(tie_exposures(frames)) if solution is None else tie_exposures(frames)
+    groups = cameras_of(frames)
+    folder = None if output is None else ResultFolder(output, overwrite=overwrite, resume=resume)
+    with folder or nullcontext():
+        path = catalog if isinstance(catalog, str | os.PathLike) else None
+        # Before the catalogue, which may take a while.
+        if folder is not None:
+            folder.check(groups, inputs=[] if path is None else [split_extension(path)[0]])
+        catalog = read_catalog(catalog)
+        run_id = uuid.uuid4().hex[:12]
+        if folder is not None:
+            plan = plan_run(
+                run_id,
+                groups,
+                settings=settings,
+                catalog=catalog,
+                catalog_path=path,
+                solution=solution,
+                update=update,
+            )
+            run_id = folder.begin(groups, plan).run
+        # Once and from the whole catalogue: a star moves alike in all frames.
+        run = _Run(frames, fill_motions(catalog), solution, settings, update, progress)
+        done = [group for group in groups if folder is not None and folder.is_done(group)]
+        outcomes = {group[0].name: folder.load(group) for group in done}
+        todo = [group for group in groups if group[0].name not in outcomes]
+        jobs = min(jobs, sum(map(len, todo)))
+        with Workers(jobs, executor) as workers:
+            for group, outcome in zip(todo, _outcomes(todo, run, workers), strict=True):
+                outcomes[group[0].name] = outcome
+                for name, error in outcome.failures.items():
+                    _log_details(name, error, folder)
+                if folder is not None:
+                    folder.write(group, outcome)
+    resumed = tuple(frame.name for group in done for frame in group)
+    return _joined(frames, list(outcomes.values()), run_id, resumed)
 
-    solutions, calibrations, superseded, cameras = {}, {}, {}, []
-    groups = cameras_of(matched)
-    holdout = _holdout_mask(catalog, settings)
+
+def _as_frames(frames):
+    """Frames of one or of any iterable, with names of their own."""
+    frames = [frames] if isinstance(frames, Frame) else list(frames)
+    if not frames:
+        raise ValueError("calibrate needs at least one frame")
+    seen = {}
+    for frame in frames:
+        if frame.name in seen:
+            raise DuplicateFrameError(
+                f"frame names must be unique: {seen[frame.name].source} and {frame.source} would "
+                f"both write {frame.name}.wcs.asdf; calibrate them into different folders"
+            )
+        seen[frame.name] = frame
+    return frames
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """What all frames of a run share."""
+
+    frames: list
+    catalog: Table
+    solution: object
+    settings: Settings
+    update: bool
+    progress: Callable
+
+    @property
+    def common(self):
+        """What a match needs besides the frame."""
+        return {"catalog": self.catalog, "settings": self.settings, "solution": self.solution}
+
+
+def _outcomes(groups, run, workers):
+    """Yield what is found of each group; those behind it are matched in the meantime."""
+    other = _of_other_detectors(run.frames, run.solution)
+    submitted = [{} if other else _submit(group, run, workers, narrow=True) for group in groups]
+    counter, n_frames = itertools.count(1), sum(map(len, groups))
+    run.progress("match", 0, n_frames)
     for k, group in enumerate(groups):
-        progress("solve", k, len(groups))
+        # Taken away, so that what is done needs no memory any more.
+        tasks, submitted[k] = submitted[k], None
+        results = {frame.name: other[frame.name] for frame in group} if other else {}
+        for name in list(tasks):
+            results[name] = tasks.pop(name)()
+            run.progress("match", next(counter), n_frames)
+        run.progress("solve", k, len(groups))
+        try:
+            if not other:
+                results = _match_group(group, results, run, workers)
+            outcome = _solve_group(group, results, run)
+        except Exception as problem:  # noqa: BLE001  One camera is not to end the run of all.
+            error = problem if isinstance(problem, WPDCError) else internal_error(problem)
+            outcome = Outcome(
+                failures={frame.name: error for frame in group},
+                rows=[summary_row(f, results[f.name], None, error, run.settings) for f in group],
+            )
+        yield outcome
+    run.progress("solve", len(groups), len(groups))
+
+
+def _solve_group(group, results, run):
+    """Solve frames that have been matched, camera by camera."""
+    solution = run.solution
+    outcome = Outcome()
+    outcome.failures.update({n: r.error for n, r in results.items() if isinstance(r, FailedFrame)})
+    matched = [r for r in results.values() if not isinstance(r, FailedFrame)]
+    holdout = _holdout_mask(run.catalog, run.settings)
+    calibrations = {}
+    for camera in cameras_of(matched):
         stored = {
-            name: _stored_of(solution, name)
-            for name in {frame.detector for frame in group}
-            if _stored_of(solution, name) is not None
+            name: stored_of(solution, name)
+            for name in {frame.detector for frame in camera}
+            if stored_of(solution, name) is not None
         }
         solved, found, failed = solve_camera(
-            group, settings, holdout=holdout, solution=stored, update=update
+            camera, run.settings, holdout=holdout, solution=stored, update=run.update
         )
-        solutions |= solved
+        outcome.solutions.update(solved)
         for name, one in solved.items():
             if name in stored and one.valid_from != stored[name].valid_from:
-                superseded[name] = replace(stored[name], valid_to=one.valid_from)
+                outcome.superseded[name] = replace(stored[name], valid_to=one.valid_from)
         if len(solved) > 1:
-            cameras.append(_camera_of(group, solved, found))
+            outcome.cameras.append(_camera_of(camera, solved, found))
         calibrations.update({c.frame: c for c in found})
-        failures.update(failed)
-    progress("solve", len(groups), len(groups))
-    ordered = [calibrations[n] for n in names if n in calibrations]
-    summary = _summarize(frames, results, calibrations, failures)
-    return CalibrationRun(ordered, solutions, failures, summary, superseded, cameras)
+        outcome.failures.update(failed)
+    outcome.calibrations.extend(calibrations[f.name] for f in group if f.name in calibrations)
+    outcome.rows.extend(
+        summary_row(
+            f,
+            results[f.name],
+            calibrations.get(f.name),
+            outcome.failures.get(f.name),
+            run.settings,
+        )
+        for f in group
+    )
+    return outcome
+
+
+def _log_details(name, error, folder):
+    """Keep where an internal error happened, in a file where there is a folder."""
+    if not isinstance(error, InternalError):
+        return
+    if folder is None:
+        log.error("%s: %s\n%s", name, error, error.details)
+    else:
+        log.info("%s: %s: details in %s", name, error, folder.log(name, error))
+
+
+def _joined(frames, outcomes, run_id, resumed):
+    """Give the result of a run from those of its groups."""
+    calibrations = {c.frame: c for outcome in outcomes for c in outcome.calibrations}
+    rows = {row["frame"]: row for outcome in outcomes for row in outcome.rows}
+    joined = {
+        name: {k: v for outcome in outcomes for k, v in getattr(outcome, name).items()}
+        for name in ("solutions", "failures", "superseded")
+    }
+    return CalibrationRun(
+        calibrations=[calibrations[f.name] for f in frames if f.name in calibrations],
+        summary=summarize([rows[frame.name] for frame in frames], run_id),
+        cameras=[camera for outcome in outcomes for camera in outcome.cameras],
+        run_id=run_id,
+        resumed=resumed,
+        **joined,
+    )
 
 
 # Detectors named in a message.
@@ -205,119 +359,56 @@ def _camera_of(group, solutions, calibrations):
     return build_camera(name, list(exposures.values()), solutions, provenance=first.provenance)
 
 
-def _match_exposures(frames, common, jobs, executor, progress):
-    """Match frames alone, then from their neighbors: frame name to `MatchedFrame` or error.
+def _submit(group, run, workers, *, narrow, sources=None):
+    """Have frames matched alone: frame name to what will return the result.
 
     A blind search takes ten times as long, above all to find nothing: in an exposure of several
     detectors it is left for those that neither they themselves nor their neighbors could match.
     """
-    settings = common["settings"]
-    keys = [(f.camera, f.exposure) for f in frames]
+    settings = replace(run.settings, blind=False) if narrow else run.settings
+    tied = _tied(group) if narrow else ()
+    return {
+        frame.name: workers.submit(
+            Task(
+                frame,
+                settings if not narrow or frame.name in tied else run.settings,
+                run.catalog,
+                run.solution,
+                None if sources is None else sources[frame.name],
+            )
+        )
+        for frame in group
+    }
+
+
+def _tied(group):
+    """Names of the frames that share an exposure with others."""
+    keys = [(f.camera, f.exposure) for f in group]
     counts = Counter(key for key in keys if None not in key)
-    tied = {f.name for f, key in zip(frames, keys, strict=True) if counts[key] > 1}
-    narrow = replace(settings, blind=False)
-    tasks = [_Task(f, narrow if f.name in tied else settings) for f in frames]
-    results = _match_frames(tasks, common, jobs, executor, progress)
-    results = start_from_neighbors(frames, results, **common)
-    if not (settings.blind and tied):
+    return {f.name for f, key in zip(group, keys, strict=True) if counts[key] > 1}
+
+
+def _match_group(group, results, run, workers):
+    """Match the frames that could not be matched alone, from their neighbors, then blind."""
+    results = start_from_neighbors(group, results, **run.common)
+    if not run.settings.blind:
         return results
-    tasks = [
-        _Task(f, settings, results[f.name].sources)
-        for f in frames
+    tied = _tied(group)
+    failed = [
+        f
+        for f in group
         if f.name in tied
         and isinstance(results[f.name], FailedFrame)
         and isinstance(results[f.name].error, MatchError)
     ]
-    if not tasks:
+    if not failed:
         return results
-    again = _match_frames(tasks, common, jobs, executor, lambda stage, done, total: None)
+    sources = {f.name: results[f.name].sources for f in failed}
+    tasks = _submit(failed, run, workers, narrow=False, sources=sources)
+    again = {name: outcome() for name, outcome in tasks.items()}
     if all(isinstance(result, FailedFrame) for result in again.values()):
         return results | again
-    return start_from_neighbors(frames, results | again, **common)
-
-
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """A frame to be matched, how, and its sources where they have been measured."""
-
-    frame: Frame
-    settings: Settings
-    sources: Table | None = None
-
-
-@one_blas_thread
-def _match_or_fail(task, catalog, solution):
-    began = time.perf_counter()
-    frame, sources = task.frame, task.sources
-    try:
-        stored = _stored_for(solution, frame)
-        if sources is None:
-            sources = measure_sources(frame, task.settings)
-        return match_frame(frame, catalog, task.settings, sources=sources, solution=stored)
-    except WPDCError as err:
-        n_sources = 0 if sources is None else len(sources)
-        return FailedFrame(err, n_sources, time.perf_counter() - began, sources)
-
-
-# A worker process is given the catalogue once, not with each frame.
-_in_worker = {}
-
-
-def _start_worker(**common):
-    _in_worker.update(common)
-
-
-def _match_in_worker(task):
-    return _match_or_fail(task, **_in_worker)
-
-
-def _match_frames(tasks, common, jobs, executor, progress):
-    """Frame name to `MatchedFrame` or error, in the order of the tasks."""
-    common = {name: common[name] for name in ("catalog", "solution")}
-    results = {}
-
-    def collect(run):
-        for task, result in zip(tasks, run, strict=True):
-            results[task.frame.name] = result
-            progress("match", len(results), len(tasks))
-        return results
-
-    progress("match", 0, len(tasks))
-    if executor is not None:
-        return collect(executor.map(partial(_match_or_fail, **common), tasks))
-    if jobs == 1 or len(tasks) == 1:
-        return collect(map(partial(_match_or_fail, **common), tasks))
-    with ProcessPoolExecutor(
-        min(jobs, len(tasks)),
-        mp_context=get_context("spawn"),
-        initializer=partial(_start_worker, **common),
-    ) as pool:
-        try:
-            return collect(pool.map(_match_in_worker, tasks))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _stored_of(solution, detector):
-    """Pick the stored solution of a detector: solutions come alone or by detector."""
-    return solution.get(detector) if isinstance(solution, Mapping) else solution
-
-
-def _stored_for(solution, frame):
-    """Find the stored solution of a frame, and refuse one of another detector."""
-    solution = _stored_of(solution, frame.detector)
-    if solution is not None and tuple(solution.image_shape) != tuple(frame.image_shape):
-        raise FitError(
-            f"{frame.source}: the frame has shape (ny, nx) {tuple(frame.image_shape)}, the stored "
-            f"solution is for {tuple(solution.image_shape)}"
-        )
-    if solution is not None and frame.detector != solution.detector:
-        raise FitError(
-            f"{frame.source}: the frame is of detector {frame.detector!r}, the stored solution of "
-            f"{solution.detector!r}; if they are one, name it (--detector {solution.detector})"
-        )
-    return solution
+    return start_from_neighbors(group, results | again, **run.common)
 
 
 def _holdout_mask(catalog, settings):
@@ -326,44 +417,3 @@ def _holdout_mask(catalog, settings):
         return None
     size = int(np.max(catalog["catalog_index"])) + 1
     return np.random.default_rng(settings.seed).uniform(size=size) < settings.holdout
-
-
-def _summarize(frames, results, calibrations, failures):
-    """One row per frame, whatever became of it."""
-    rows = []
-    for frame in frames:
-        found = calibrations.get(frame.name)
-        result = results[frame.name]
-        row = {
-            "frame": frame.name,
-            "detector": frame.detector,
-            "camera": frame.camera or "",
-            "exposure": frame.exposure or "",
-            "status": "failed" if found is None else found.statistics["status"],
-            "reason": " ".join(str(failures[frame.name]).split())
-            if found is None
-            else "; ".join(found.statistics["reasons"]),
-            "n_sources": result.n_sources,
-            "n_matched": 0 if found is None else found.statistics["n_matched"],
-        }
-        # A frame may be matched with good evidence and fail afterwards.
-        evidence = getattr(result, "diagnostics", None)
-        for name in ("n_pairs", "n_ambiguous"):
-            row[name] = getattr(evidence, name, 0)
-        for name in ("expected_by_chance", "purity", "completeness", "significance"):
-            row[name] = getattr(evidence, name, np.nan)
-        statistics = {} if found is None else found.statistics
-        inside, outside = (statistics.get(key, {}) for key in ("residuals", "holdout"))
-        for name in ("mean_dx", "sigma_dx", "mean_dy", "sigma_dy"):
-            row[name] = inside.get(name, np.nan)
-        for name in ("sigma_dx", "sigma_dy"):
-            row[f"holdout_{name}"] = outside.get(name, np.nan)
-        row["rms_mas"] = statistics.get("rms_mas", np.nan)
-        row["seconds"] = statistics.get("seconds", result.seconds)
-        rows.append(row)
-    table = QTable(rows)
-    for name in table.colnames:
-        if "_d" in name:
-            table[name].unit = "pix"
-    table["rms_mas"].unit, table["seconds"].unit = "mas", "s"
-    return table

@@ -1,8 +1,13 @@
 """Choices of a calibration."""
 
+import math
 from dataclasses import dataclass
+from numbers import Integral
+
+import numpy as np
 
 from wpdc_gwcs.fitting import RadialWeight
+from wpdc_gwcs.selection import MAX_ROUNDNESS, MIN_SNR
 
 __all__ = ["Settings"]
 
@@ -45,8 +50,16 @@ class Settings:
     threshold : float, optional
         Detection threshold in standard deviations of the background.
     min_snr : float, optional
-        Least signal-to-noise ratio, in an aperture of 1.5 FWHM in radius, of the sources kept from
-        an image; 0 keeps all that were detected.
+        Least signal-to-noise ratio of the sources that are matched; of an image, only those that
+        reach it in an aperture of 1.5 FWHM in radius are kept.  0 keeps all.
+    max_roundness : float, optional
+        Greatest difference between the roundness of a source that is matched and that of the
+        frame's stars.
+    max_mag : float, optional
+        Magnitude of the faintest reference stars used; `None`: all.
+    gain, saturation : float, optional
+        Electrons per count, and counts at which pixels are saturated, in place of what the headers
+        say.
     holdout : float, optional
         Share of the reference stars, 0 to 0.9, kept out of every fit and measured separately.
     blind : bool, optional
@@ -64,7 +77,11 @@ class Settings:
     centroids: str = "psf"
     reference_point: str = "header"
     threshold: float = 5.0
-    min_snr: float = 10.0
+    min_snr: float = MIN_SNR
+    max_roundness: float = MAX_ROUNDNESS
+    max_mag: float | None = None
+    gain: float | None = None
+    saturation: float | None = None
     holdout: float = 0.0
     blind: bool = False
     seed: int = 0
@@ -84,8 +101,20 @@ class Settings:
             raise ValueError(f"holdout must be between 0 and 0.9, got {self.holdout}")
         if not self.threshold > 0:
             raise ValueError(f"threshold must be positive, got {self.threshold}")
+        if not (isinstance(self.seed, Integral) and 0 <= self.seed < 1 << 63):
+            raise ValueError(f"seed must be an integer from 0 to 2^63 - 1, got {self.seed!r}")
+        if not (self.threshold < np.inf and self.min_snr < np.inf):
+            raise ValueError(
+                f"threshold and min_snr must be finite, got {self.threshold} and {self.min_snr}"
+            )
         if not self.min_snr >= 0:
             raise ValueError(f"min_snr must be 0 or more, got {self.min_snr}")
+        if self.max_mag is not None and not math.isfinite(self.max_mag):
+            raise ValueError(f"max_mag must be a magnitude, got {self.max_mag}")
+        for name in ("max_roundness", "gain", "saturation"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive, got {value}")
 
     def radial_weight(self, image_shape):
         """Return the radial weight for a detector.

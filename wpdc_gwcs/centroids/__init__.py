@@ -6,6 +6,12 @@
     Background, sources, PSF --fit_centroids--> sources with x, y, errors, flux, chi2
 """
 
-from wpdc_gwcs.centroids._high_level import build_epsf, fit_centroids, subtract_stars
+from wpdc_gwcs.centroids._high_level import (
+    StarNoise,
+    build_epsf,
+    fit_centroids,
+    measure_noise,
+    subtract_stars,
+)
 
-__all__ = ["build_epsf", "fit_centroids", "subtract_stars"]
+__all__ = ["StarNoise", "build_epsf", "fit_centroids", "measure_noise", "subtract_stars"]

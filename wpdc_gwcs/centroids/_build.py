@@ -109,8 +109,8 @@ def fit_moffat(field, noise, stars, fwhm, *, half, radius):
     any function of the phase go with a profile that fits as well.
     """
     shape = np.array([np.log(max(0.5 * np.sqrt(max(fwhm**2 - 0.7, 0.3)), 0.3)), np.log(2.0), 0, 0])
-    lowest = [np.log(0.2), np.log(0.3), -0.6, -0.6]
-    highest = [np.log(2 * fwhm), np.log(30.0), 0.6, 0.6]
+    lowest = [np.log(0.2), np.log(0.3), -0.9, -0.9]
+    highest = [np.log(2 * fwhm), np.log(30.0), 0.9, 0.9]
     steps = np.diag([0.02, 0.05, 0.01, 0.01])
 
     def profile_of(parameters):
@@ -136,7 +136,7 @@ def fit_moffat(field, noise, stars, fwhm, *, half, radius):
     return shape
 
 
-def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations):
+def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations, finest=None):
     """Refine a profile and the positions of its stars in turn.
 
     Parameters
@@ -156,6 +156,8 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations)
         Electrons per count.
     iterations : int
         Number of rounds.
+    finest : float, optional
+        FWHM in px of the finest structure expected in the profile; by default that of the stars.
 
     Returns
     -------
@@ -175,7 +177,7 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations)
         noise = estimate_noise(field, profile, noise, stars, radius=radius, gain=gain)
         # A profile is never known better, and the brightest stars must not rule alone.
         noise = replace(noise, mismatch=float(np.clip(noise.mismatch, 0.003, 0.3)))
-        change = _residual_coefficients(field, noise, start, stars, fwhm)
+        change = _residual_coefficients(field, noise, start, stars, fwhm, finest or fwhm)
         profile = _centered(replace(start, coefficients=start.coefficients + change), fwhm)
     fits = fit_stars(field, profile, noise, stars, radius=radius)
     return profile, fits.stars.take(fits.valid), noise
@@ -297,7 +299,7 @@ def _reduced_normal(field, profile, noise, stars, modes, radius):
     return reduced[:, :, :-1], reduced[:, :, -1]
 
 
-def _residual_coefficients(field, noise, profile, stars, fwhm):
+def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
     """Spline coefficients that take up what a profile leaves: penalised least squares."""
     over, size = profile.oversampling, profile.coefficients.shape[-1]
     half = profile.radius - 1
@@ -332,7 +334,7 @@ def _residual_coefficients(field, noise, profile, stars, fwhm):
         lower = offset >= 0
         column = np.broadcast_to(index[:, None, :], offset.shape)
         np.add.at(band, (offset[lower], column[lower]), normal[lower])
-    _add_prior(band, profile.samples().mean(axis=0), fwhm, over)
+    _add_prior(band, profile.samples().mean(axis=0), fwhm, finest, over)
     try:
         solution = solveh_banded(band, right, lower=True, overwrite_ab=True, check_finite=False)
     except LinAlgError:
@@ -340,16 +342,17 @@ def _residual_coefficients(field, noise, profile, stars, fwhm):
     return solution.reshape(size, size)
 
 
-def _add_prior(band, samples, fwhm, over):
+def _add_prior(band, samples, fwhm, finest, over):
     """Add the expectation that a difference is small and smooth to banded normal equations."""
     size = samples.shape[0]
     center = (size - 1) // 2
     radius = np.hypot(*np.meshgrid(np.arange(size) - center, np.arange(size) - center)) / over
     # A smooth envelope of the profile, with wings that stay open for spikes and haloes.
     envelope = samples.max() * (1 + (2 * radius / fwhm) ** 2 * (2**0.5 - 1)) ** -2
-    sigma = fwhm * _SIGMA_PER_FWHM * over  # grid steps
+    sigma = finest * _SIGMA_PER_FWHM * over  # grid steps
     rough = (_ROUGHNESS * 3 * sigma**-4 * envelope) ** -2
-    own = (_DEVIATION * envelope) ** -2
+    # Where there is finer structure than in a star of this width, the start is only its outline.
+    own = (_DEVIATION * (fwhm / finest) * envelope) ** -2
     # Nothing is known about the rim: the profile there is the start's.
     rim = np.abs(np.arange(size) - center) > center - over
     own[rim] *= 1e8

@@ -53,11 +53,31 @@ class Noise:
     inverse_gain: float = 0.0
     mismatch: float = 0.02
 
-    def variance(self, sky_variance, model):
-        """Variance for pixels of given background variance and model counts."""
+    def variance(self, sky, model):
+        """Variance for pixels of given sky and model counts."""
         model = np.maximum(model, 0)
         peak = model.max(axis=-1, keepdims=True)
-        return sky_variance + model * (self.inverse_gain + self.mismatch**2 * peak)
+        return sky.variance + model * (self.inverse_gain * sky.photons + self.mismatch**2 * peak)
+
+
+class Sky(NamedTuple):
+    """Background of pixels.
+
+    Parameters
+    ----------
+    variance : (N, n) ndarray
+        Variance.
+    photons : (N, n) ndarray or float
+        Variance of photons relative to what the gain says, where pixels differ in response.
+    """
+
+    variance: np.ndarray
+    photons: np.ndarray | float
+
+    def take(self, rows):
+        """Background of the given rows."""
+        photons = self.photons
+        return Sky(self.variance[rows], photons if np.isscalar(photons) else photons[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +90,14 @@ class Field:
         Image without background, and the noise of the background.
     mask : (ny, nx) bool ndarray or None
         True where a pixel must not be used.
+    photons : (ny, nx) ndarray or None
+        As in `Sky`; None for pixels of one response.
     """
 
     image: np.ndarray
     rms: np.ndarray
     mask: np.ndarray | None
+    photons: np.ndarray | None = None
 
     def cut(self, stars, half, radius):
         """Cut out the surroundings of stars.
@@ -96,8 +119,8 @@ class Field:
             Values.
         use : (N, n) bool ndarray
             True where a pixel is on the image, good and within the radius.
-        sky : (N, n) ndarray
-            Variance of the background.
+        sky : Sky
+            Noise of the background.
         """
         xc, yc = np.rint(stars.x).astype(int), np.rint(stars.y).astype(int)
         pixels, use = cutouts(self.image, xc, yc, half)
@@ -105,8 +128,9 @@ class Field:
         use &= (np.hypot(step[:, None], step) <= radius).ravel()
         if self.mask is not None:
             use &= ~cutouts(self.mask, xc, yc, half)[0]
-        sky = cutouts(self.rms, xc, yc, half)[0].astype(float) ** 2
-        return xc, yc, pixels.astype(float), use, sky
+        variance = cutouts(self.rms, xc, yc, half)[0].astype(float) ** 2
+        photons = 1.0 if self.photons is None else cutouts(self.photons, xc, yc, half)[0]
+        return xc, yc, pixels.astype(float), use, Sky(variance, photons)
 
 
 class Stars(NamedTuple):
@@ -212,7 +236,7 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
             x[active] - xc[active], y[active] - yc[active], half, shares[active]
         )
         step, *_rest = _normal_step(
-            basis, flux[active], pixels[active], use[active], sky[active], noise
+            basis, flux[active], pixels[active], use[active], sky.take(active), noise
         )
         shift = np.clip(step[:, :2], -_MAX_STEP, _MAX_STEP)
         x[active] += shift[:, 0]
@@ -362,7 +386,7 @@ def estimate_noise(field, profile, noise, stars, *, radius, gain=None):
     basis = profile.evaluate(stars.x - xc, stars.y - yc, half, shares)
     flux = stars.flux
     model = flux[:, None] * basis[0]
-    use &= model > np.sqrt(sky)
+    use &= model > np.sqrt(sky.variance)
     weight = use / noise.variance(sky, model)
     jacobian = np.stack([flux[:, None] * b for b in basis[1:]] + [basis[0]], axis=1)
     normal = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
@@ -375,12 +399,12 @@ def estimate_noise(field, profile, noise, stars, *, radius, gain=None):
         return replace(noise, inverse_gain=0.0 if gain is None else 1 / gain)
     residual2 = ((pixels - model) ** 2)[use] / (1 - leverage[use])
     square = (model * model.max(axis=1, keepdims=True))[use]
-    model, sky = model[use], sky[use]
+    photons, sky = (model * sky.photons)[use], sky.variance[use]
     order = np.argsort(square)
     bins = np.array_split(order, int(np.clip(len(order) // 50, 1, 40)))
     # 1.4826 MAD squared = median of the squares / 0.4549
     measured = np.array([np.median(residual2[b]) for b in bins]) / 0.4549 + 1e-30
-    m, s, q = (np.array([np.mean(v[b]) for b in bins]) for v in (model, sky, square))
+    m, s, q = (np.array([np.mean(v[b]) for b in bins]) for v in (photons, sky, square))
     known = s if gain is None else s + m / gain
 
     def variance(logs):

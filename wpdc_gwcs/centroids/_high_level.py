@@ -2,7 +2,7 @@
 
 import logging
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,16 +25,14 @@ from wpdc_gwcs.centroids._fit import (
 )
 from wpdc_gwcs.centroids._profile import Profile, moffat_samples, spline_coefficients
 from wpdc_gwcs.exceptions import CentroidWarning
+from wpdc_gwcs.flags import FLAG_FIT_FAILED
+from wpdc_gwcs.selection import select_sources
 from wpdc_gwcs.threads import one_blas_thread
 
-__all__ = ["build_epsf", "fit_centroids", "subtract_stars"]
+__all__ = ["StarNoise", "build_epsf", "fit_centroids", "measure_noise", "subtract_stars"]
 
 log = logging.getLogger(__name__)
 
-# The bit of the column ``flags`` for a failed fit, as in `wpdc_gwcs.detection`.
-_FLAG_FIT_FAILED = 64
-
-_MAX_ROUNDNESS = 0.4
 # Stars whose residuals tell the error of the PSF.
 _MAX_STARS = 1000
 _MIN_STARS = 8
@@ -48,6 +46,10 @@ _NEGLIGIBLE = 0.05
 _CHUNK = 10_000
 # Error of the PSF, relative, below which a residual is no sign of another star.
 _MODEL_ERROR = 0.1
+# Error of the PSF, relative, up to which it is as smooth as its width tells; and the FWHM in px of
+# the finest structure looked for otherwise.
+_FAIR_MISMATCH = 0.03
+_FINEST = 1.4
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
 
@@ -110,17 +112,16 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
     >>> epsf.oversampling
     array([4, 4])
     """
-    field = _field_of(data, error)
+    field, unit = _field_of(data, error)
     if vary not in ("auto", "never"):
         raise ValueError(f"vary must be 'auto' or 'never', got {vary!r}")
-    stars = _stars_of(sources)
+    stars = _stars_of(sources, unit)
     snr = np.asarray(sources["snr"], dtype=float)
-    flags, is_round = _flags_and_shape(sources)
-    quality = is_round & (flags == 0)
+    quality = select_sources(sources)
     fwhm = _typical_fwhm(sources)
     rows = select_stars(stars, snr, quality, fwhm, field.image.shape, n_max=n_max, min_snr=min_snr)
     if len(rows) >= _MIN_STARS:
-        profile = _learn(field, stars.take(rows), fwhm, gain, vary)
+        profile = _learn(field, stars.take(rows), fwhm, _per_unit(gain, unit), vary)
         if profile is not None:
             return _to_photutils(profile)
     warnings.warn(
@@ -141,7 +142,18 @@ def _learn(field, stars, fwhm, gain, vary):
     shape = fit_moffat(field, noise, stars.take(slice(200)), fwhm, half=half, radius=wide)
     start = Profile.constant(moffat_samples(shape, half, OVERSAMPLING), OVERSAMPLING)
     options = {"fwhm": fwhm, "radius": radius, "gain": gain}
-    profile, stars, noise = learn_profile(field, noise, stars, start, iterations=4, **options)
+    chosen = stars
+    profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=4, **options)
+    finest = fwhm
+    while noise.mismatch > _FAIR_MISMATCH and finest > 2 * _FINEST:
+        # Rings and trails have edges that are finer than they are wide.
+        finest = max(0.25 * finest, _FINEST)
+        finer = options | {"iterations": 4, "finest": finest}
+        found = learn_profile(field, noise, chosen, profile, **finer)
+        if len(found[1].x) >= max(_MIN_STARS, len(stars.x) // 2):
+            if found[2].mismatch < noise.mismatch:
+                options["finest"] = finest
+                profile, stars, noise = found
     n = len(stars.x)
     if n < _MIN_STARS:
         return None
@@ -226,15 +238,20 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3, refit
     >>> bool(abs(fitted["x"][-1] - x0) < 0.02), bool(abs(fitted["y"][-1] - y0) < 0.02)
     (True, True)
     """
-    field = _field_of(data, error, saturation=sources.meta.get("saturation"))
+    field, unit = _field_of(data, error, saturation=sources.meta.get("saturation"))
     if passes < 1:
         raise ValueError(f"passes must be at least 1, got {passes}")
     profile = _from_photutils(epsf)
     fwhm = _typical_fwhm(sources)
-    stars = _stars_of(sources)
-    flags, is_round = _flags_and_shape(sources)
-    fits = _fit(field, profile, stars, is_round & (flags == 0), fwhm, gain, passes, refit)
-    return _fitted_table(sources, fits, flags, fwhm)
+    stars = _stars_of(sources, unit)
+    quality = select_sources(sources)
+    fits = _fit(field, profile, stars, quality, fwhm, _per_unit(gain, unit), passes, refit)
+    flags = (
+        np.array(sources["flags"], int)
+        if "flags" in sources.colnames
+        else np.zeros(len(stars.x), int)
+    )
+    return _fitted_table(sources, fits, flags, fwhm, unit)
 
 
 @one_blas_thread
@@ -264,16 +281,72 @@ def subtract_stars(background, sources, epsf, *, gain=None):
     """
     profile = _from_photutils(epsf)
     drawn = np.isfinite(np.asarray(sources["chi2"], dtype=float))
-    model = render(background.image.shape, profile, _stars_of(sources).take(drawn))
+    stars = _stars_of(sources, background.unit).take(drawn)
+    model = render(background.image.shape, profile, stars)
     variance = background.rms.astype(np.float32) ** 2 + (_MODEL_ERROR * model) ** 2
     if gain is not None:
-        variance += np.maximum(model, 0) / gain
+        photons = np.maximum(model, 0) / (gain * background.unit)
+        variance += photons if background.photons is None else photons * background.photons
     return replace(background, image=background.image - model, rms=np.sqrt(variance))
 
 
+@dataclass(frozen=True)
+class StarNoise:
+    """What the residuals of bright stars tell of an image.
+
+    Parameters
+    ----------
+    gain : float
+        Electrons per count by which the noise grows with the stars' light.
+    mismatch : float
+        Error of the PSF at its peak, relative to its value there.
+    n_stars : int
+        Number of stars.
+    """
+
+    gain: float
+    mismatch: float
+    n_stars: int
+
+
 @one_blas_thread
-def _fit(field, profile, stars, quality, fwhm, gain, passes, refit):
-    """Fits of all stars; those of good quality tell the noise."""
+def measure_noise(data, sources, epsf, *, error=None):
+    """Measure gain and error of the PSF on the residuals of bright stars.
+
+    Parameters
+    ----------
+    data : Background or (ny, nx) array_like
+        Image without background; of a plain array, ``error`` must be given.
+    sources : `~astropy.table.Table`
+        As for `fit_centroids`.
+    epsf : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
+        Effective PSF.
+    error : float or (ny, nx) array_like, optional
+        Standard deviation of the background; only for a plain array.
+
+    Returns
+    -------
+    StarNoise
+        Gain, error of the PSF, number of stars.
+
+    Notes
+    -----
+    The PSF has taken some of the stars' noise into it: the gain comes out up to a third too high.
+
+    Examples
+    --------
+    See `fit_centroids`.
+    """
+    field, unit = _field_of(data, error, saturation=sources.meta.get("saturation"))
+    fwhm = _typical_fwhm(sources)
+    stars = _stars_of(sources, unit)
+    quality = select_sources(sources)
+    noise, n = _noise_of(field, _from_photutils(epsf), stars, quality, fwhm, None)
+    return StarNoise(1 / max(noise.inverse_gain * unit, 1e-300), noise.mismatch, n)
+
+
+def _noise_of(field, profile, stars, quality, fwhm, gain):
+    """Noise by the residuals of the brightest stars of good quality, and how many they are."""
     radius = _fit_radius(fwhm)
     noise = Noise(0.0 if gain is None else 1 / gain, 0.02)
     candidates = np.flatnonzero(quality & (stars.flux > 0))
@@ -282,6 +355,14 @@ def _fit(field, profile, stars, quality, fwhm, gain, passes, refit):
     clean = star_like(fits.stars.flux, fits.chi2, fits.valid)
     noise = estimate_noise(field, profile, noise, fits.stars.take(clean), radius=radius, gain=gain)
     log.info("noise of the fits: %s", noise)
+    return noise, int(clean.sum())
+
+
+@one_blas_thread
+def _fit(field, profile, stars, quality, fwhm, gain, passes, refit):
+    """Fits of all stars; those of good quality tell the noise."""
+    radius = _fit_radius(fwhm)
+    noise, _ = _noise_of(field, profile, stars, quality, fwhm, gain)
     if refit:
         fits = StarFits.unfitted(stars)
     else:
@@ -321,7 +402,7 @@ def _disturbed(field, model, profile, own, radius):
         shares = profile.shares(stars.x, stars.y)
         mine = profile.evaluate(stars.x - xc, stars.y - yc, half, shares, gradient=False)[0]
         light = pixels - stars.flux[:, None] * mine
-        limit = _NEGLIGIBLE * (np.sqrt(sky) + 0.01 * np.abs(pixels))
+        limit = _NEGLIGIBLE * (np.sqrt(sky.variance) + 0.01 * np.abs(pixels))
         result.append(start + np.flatnonzero((use & (np.abs(light) > limit)).any(axis=1)))
     return np.concatenate(result) if result else np.zeros(0, int)
 
@@ -331,10 +412,10 @@ def _near(stars, start, fwhm):
     return np.hypot(stars.x - start.x, stars.y - start.y) < max(0.5 * fwhm, 1.0)
 
 
-def _fitted_table(sources, fits, flags, fwhm):
-    """Copy of the sources with the results of the fits."""
+def _fitted_table(sources, fits, flags, fwhm, unit):
+    """Copy of the sources with the results of the fits, in counts."""
     result = sources.copy()
-    good = fits.valid & _near(fits.stars, _stars_of(sources), fwhm)
+    good = fits.valid & _near(fits.stars, _stars_of(sources, unit), fwhm)
     error = np.sqrt(np.where(good[:, None], np.einsum("sii->si", fits.covariance), np.nan))
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = fits.stars.flux / error[:, 2]
@@ -345,8 +426,8 @@ def _fitted_table(sources, fits, flags, fwhm):
         "y": fits.stars.y,
         "x_err": error[:, 0],
         "y_err": error[:, 1],
-        "flux": fits.stars.flux,
-        "flux_err": error[:, 2],
+        "flux": fits.stars.flux * unit,
+        "flux_err": error[:, 2] * unit,
         "snr": snr,
     }
     for name, values in columns.items():
@@ -356,23 +437,18 @@ def _fitted_table(sources, fits, flags, fwhm):
     # Neither a star nor noise: far worse than its like, which share the error of the PSF.
     alike = star_like(fits.stars.flux, fits.chi2, good, limit=_MAX_CHI2)
     poor = ~good | (~alike & (fits.chi2 > _MAX_CHI2))
-    result["flags"] = flags | np.where(poor, _FLAG_FIT_FAILED, 0)
+    result["flags"] = flags | np.where(poor, FLAG_FIT_FAILED, 0)
     return result
 
 
-def _flags_and_shape(sources):
-    """Read the flags, and whether sources are round enough for stars; good without the columns."""
-    n = len(sources)
-    flags = (
-        np.array(sources["flags"], dtype=int) if "flags" in sources.colnames else np.zeros(n, int)
-    )
-    if "roundness" not in sources.colnames:
-        return flags, np.ones(n, bool)
-    return flags, np.abs(np.asarray(sources["roundness"], dtype=float)) < _MAX_ROUNDNESS
+def _stars_of(sources, unit):
+    x, y, flux = (np.array(sources[c], dtype=float) for c in ("x", "y", "flux"))
+    return Stars(x, y, flux / unit)
 
 
-def _stars_of(sources):
-    return Stars(*(np.array(sources[c], dtype=float) for c in ("x", "y", "flux")))
+def _per_unit(gain, unit):
+    """Electrons in one unit of the pixels fitted."""
+    return None if gain is None else gain * unit
 
 
 def _fit_radius(fwhm):
@@ -389,25 +465,28 @@ def _typical_fwhm(sources):
 
 
 def _field_of(data, error, saturation=None):
-    """Image, noise and mask of a Background, or of a plain array and its error."""
+    """Image, noise and mask of a Background, or of a plain array and its error; and the unit."""
     if hasattr(data, "rms"):
         if error is not None:
             raise ValueError("error must not be given: the Background has its own")
         if saturation is None:
-            return Field(data.image, data.rms, data.mask)
+            return Field(data.image, data.rms, data.mask, data.photons), data.unit
         # The wings of a saturated star still tell its flux, which matters to its neighbours.
         full = data.data >= saturation
-        return Field(data.image, data.rms, full if data.mask is None else full | data.mask)
+        mask = full if data.mask is None else full | data.mask
+        return Field(data.image, data.rms, mask, data.photons), data.unit
     image = np.asarray(data)
     if image.ndim != 2:
         raise ValueError(f"the image must be 2-D, got {image.ndim} dimensions")
     if error is None:
         raise ValueError("error must be given when data is a plain array")
     bad = ~np.isfinite(image)
-    rms = np.broadcast_to(np.asarray(error, dtype=float), image.shape)
-    if not (rms > 0).all():
+    error = np.asarray(error, dtype=float)
+    if not (error > 0).all():
         raise ValueError("error must be positive")
-    return Field(np.where(bad, 0.0, image), rms, bad if bad.any() else None)
+    unit = float(np.median(error))
+    rms = np.broadcast_to(error / unit, image.shape)
+    return Field(np.where(bad, 0.0, image / unit), rms, bad if bad.any() else None), unit
 
 
 def _to_photutils(profile):

@@ -1,14 +1,18 @@
 """The `wpdc` application: its commands, and what becomes of errors, warnings and Ctrl-C.
 
 Exit status: 0 all is well; 1 a frame could not be solved, or a result failed its test; 2 wrong
-usage or unreadable input; 130 interrupted.  Every failure is one line on standard error that says
-what, which rule and which value.
+usage or unreadable input; 130 interrupted, 143 told to end.  Every failure is one line on standard
+error that says what, which rule and which value.
 """
 
 import logging
 import os
+import signal
 import sys
+import threading
+import traceback
 import warnings
+from contextlib import contextmanager
 from typing import Annotated
 
 import typer
@@ -109,6 +113,44 @@ def run(args=None):
         Exit status.
     """
     set_verbosity(0, quiet=False)
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            # Names may have characters that the terminal has not.
+            stream.reconfigure(errors="backslashreplace")
+    with _signals() as received:
+        return _run(args, received)
+
+
+@contextmanager
+def _signals():
+    """Take the signals that end a program as one interruption, after which nothing disturbs.
+
+    The list that is given holds the signal that came.
+    """
+    received = []
+
+    def interrupt(number, frame):
+        for one in before:
+            signal.signal(one, signal.SIG_IGN)
+        received.append(number)
+        raise KeyboardInterrupt
+
+    names = ("SIGINT", "SIGTERM", "SIGHUP")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        # What is ignored, as SIGHUP under nohup, stays so.
+        before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) != signal.SIG_IGN}
+    for number in before:
+        signal.signal(number, interrupt)
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _run(args, received):
     try:
         status = app(args=args, prog_name="wpdc", standalone_mode=False)
         sys.stdout.flush()
@@ -122,7 +164,8 @@ def run(args=None):
     except (FrameFailure, WPDCError) as err:
         return _fail(err, 1)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted; files already written are complete", _INTERRUPTED)
+        status = 128 + received[0] if received else _INTERRUPTED
+        return _fail("interrupted; files already written are complete", status)
     except BrokenPipeError:
         # The reader of our output has gone, which is no error; the exit must not flush again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -131,6 +174,12 @@ def run(args=None):
         if err.filename is None:
             return _fail(err.strerror or err, 2)
         return _fail(f"{err.filename}: {err.strerror}", 2)
+    except MemoryError as err:
+        return _fail(f"not enough memory: {err}", 1)
+    except Exception as err:  # noqa: BLE001  A mistake of ours, told in one line like those of others.
+        if logging.getLogger("wpdc_gwcs").isEnabledFor(logging.DEBUG):
+            traceback.print_exception(err)
+        return _fail(f"internal error: {type(err).__name__}: {err} (-vv shows where)", 1)
 
 
 def _usage(err):
@@ -146,7 +195,3 @@ def _usage(err):
 def main():
     """Entry point of the `wpdc` command."""
     sys.exit(run())
-
-
-# The commands register themselves with the application.
-from wpdc_gwcs.cli import calibrate, demo, files, stages  # noqa: E402, F401

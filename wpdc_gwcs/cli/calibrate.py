@@ -2,9 +2,8 @@
 
 import logging
 import os
-import tempfile
+import time
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -14,20 +13,29 @@ from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import (
     Config,
     Epoch,
+    Gain,
+    Mask,
+    MaskBits,
+    MaxMag,
+    MaxRoundness,
     MinSNR,
     Origin,
     Overwrite,
     PixelScale,
     Preset,
     Quiet,
+    Saturation,
     Threshold,
     Verbose,
+    WeightMap,
     by_hand,
+    require_free,
     require_plotting,
     state_first_pixel,
 )
 from wpdc_gwcs.cli.progress import progress_bar
-from wpdc_gwcs.exceptions import InputError
+from wpdc_gwcs.cli.report import write_page
+from wpdc_gwcs.exceptions import InputError, InternalError
 
 log = logging.getLogger("wpdc_gwcs.cli")
 
@@ -150,6 +158,13 @@ def calibrate_command(
     ] = "header",
     threshold: Threshold = 5.0,
     min_snr: MinSNR = 10.0,
+    max_roundness: MaxRoundness = 0.3,
+    max_mag: MaxMag = None,
+    gain: Gain = None,
+    saturation: Saturation = None,
+    mask: Mask = None,
+    mask_bits: MaskBits = None,
+    weight_map: WeightMap = None,
     blind: Annotated[
         bool,
         typer.Option(
@@ -175,6 +190,17 @@ def calibrate_command(
             metavar="ADDRESS", help="Address of a running Dask scheduler, instead of --jobs."
         ),
     ] = None,
+    scheduler_timeout: Annotated[
+        float,
+        typer.Option(metavar="SECONDS", help="How long to wait for the scheduler and its workers."),
+    ] = 60.0,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Leave out what a run of the same inputs, options and version has done already.",
+        ),
+    ] = False,
     report: Annotated[
         bool, typer.Option("--report", help="Also write report.html with figures.")
     ] = False,
@@ -193,7 +219,7 @@ def calibrate_command(
     of the summary says why.
     """
     from wpdc_gwcs.calibration import Settings, calibrate
-    from wpdc_gwcs.catalogs import read_catalog
+    from wpdc_gwcs.calibration.results import ERRORS
     from wpdc_gwcs.io import read_frames
 
     if report:
@@ -202,6 +228,10 @@ def calibrate_command(
         raise InputError("--update needs the stored solution: --solution FILE")
     if no_camera and exposure_key is not None:
         raise InputError("--exposure-key ties detectors together, --no-camera keeps them apart")
+    if detector is not None and not (detector.strip() and detector.isprintable()):
+        raise InputError(f"--detector must be a name that can be printed, got {detector!r}")
+    if not 0 < scheduler_timeout < float("inf"):
+        raise InputError(f"--scheduler-timeout must be positive seconds, got {scheduler_timeout}")
     if jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     try:
@@ -216,6 +246,10 @@ def calibrate_command(
             reference_point=reference_point,
             threshold=threshold,
             min_snr=min_snr,
+            max_roundness=max_roundness,
+            max_mag=max_mag,
+            gain=gain,
+            saturation=saturation,
             blind=blind,
             holdout=holdout,
             seed=seed,
@@ -225,28 +259,35 @@ def calibrate_command(
 
     keys = {"exposure_keyword": exposure_key, "camera": not no_camera}
     keys |= by_hand(epoch, pixel_scale, origin)
+    keys |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
     loaded = [f for path in frames for f in read_frames(path, wcs=wcs, detector=detector, **keys)]
-    results = Results(output, loaded, overwrite=overwrite)
+    page = output / "report.html"
     if report:
-        results.require_free("report.html")
-    reference = read_catalog(catalog)
+        require_free(page, overwrite or resume)
     stored = stored_solutions(solution or [])
-    with executor(scheduler) as pool, progress_bar(quiet=quiet) as progress:
+    with executor(scheduler, scheduler_timeout) as pool, progress_bar(quiet=quiet) as progress:
         run = calibrate(
             loaded,
-            reference,
+            catalog,
             solution=stored,
             update=update,
             settings=settings,
             jobs=jobs,
             executor=pool,
+            output=output,
+            overwrite=overwrite,
+            resume=resume,
             progress=progress,
         )
-    results.write(run)
     if report:
         tables = {c.frame: c.matches for c in run.calibrations}
-        write_page(run.summary, run.solutions, tables, output / "report.html", overwrite=overwrite)
+        write_page(run.summary, run.solutions, tables, page, overwrite=overwrite or resume)
     if not quiet:
+        if resume:
+            typer.echo(
+                f"{len(run.resumed)} of {len(run.summary)} frames are left out: done already by "
+                f"run {run.run_id}"
+            )
         print_summary(run, output)
         if update:
             print_changes(run)
@@ -257,37 +298,12 @@ def calibrate_command(
                 "%s: degraded: %s", calibration.frame, "; ".join(calibration.statistics["reasons"])
             )
     for name, error in run.failures.items():
-        log.error("%s: not solved: %s", name, error)
+        details = f" (details in {output / ERRORS})" if isinstance(error, InternalError) else ""
+        log.error("%s: not solved: %s%s", name, error, details)
     if any(isinstance(error, InputError) for error in run.failures.values()):
         raise typer.Exit(2)
     if run.failures:
         raise typer.Exit(1)
-
-
-def write_page(summary, solutions, matches, path, *, overwrite):
-    """Write the report, whole or not at all.
-
-    Parameters
-    ----------
-    summary : `~astropy.table.Table`
-        One row per frame.
-    solutions : dict
-        Detector name to solution.
-    matches : dict
-        Frame name to match table.
-    path : Path
-        File to write.
-    overwrite : bool
-        Whether it may be replaced.
-    """
-    from wpdc_gwcs.io import atomic_path
-    from wpdc_gwcs.report import write_report
-
-    with (
-        atomic_path(path, overwrite=overwrite) as temporary,
-        temporary.open("w", encoding="utf-8") as file,
-    ):
-        write_report(summary, solutions, matches, file)
 
 
 def stored_solutions(paths):
@@ -328,125 +344,6 @@ def stored_solutions(paths):
     return single if len(paths) == 1 and single is not None else found
 
 
-class Results:
-    """Files of one calibration: checked before the work begins, written after it.
-
-    Parameters
-    ----------
-    folder : Path
-        Output folder.
-    frames : list of Frame
-        Frames to be calibrated.
-    overwrite : bool
-        Whether files may be replaced.
-    """
-
-    def __init__(self, folder, frames, *, overwrite):
-        self.folder = folder
-        self.overwrite = overwrite
-        self._check_names(frames)
-        self._make_folder()
-        for frame in frames:
-            for suffix in (".wcs.asdf", ".matches.ecsv", ".sources.ecsv"):
-                self.require_free(frame.name + suffix)
-        for detector in {frame.detector for frame in frames}:
-            self.require_free(f"{file_stem(detector)}.solution.asdf")
-        cameras = {frame.camera for frame in frames if frame.camera}
-        for camera in cameras:
-            if len({frame.detector for frame in frames if frame.camera == camera}) > 1:
-                self.require_free(f"{file_stem(camera)}.camera.asdf")
-        self.require_free("summary.ecsv")
-
-    @staticmethod
-    def _check_names(frames):
-        seen = {}
-        for frame in frames:
-            if frame.name in seen:
-                raise InputError(
-                    f"{frame.source} and {seen[frame.name]} would both write "
-                    f"{frame.name}.wcs.asdf: calibrate them into different folders"
-                )
-            seen[frame.name] = frame.source
-
-    def _make_folder(self):
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=self.folder):
-                pass
-        except OSError as err:
-            raise InputError(
-                f"{self.folder}: the output folder must be writable: {err.strerror}"
-            ) from err
-
-    def require_free(self, name):
-        """Refuse to go on if a file is there and may not be replaced.
-
-        Parameters
-        ----------
-        name : str
-            Name of the file in the folder.
-        """
-        path = self.folder / name
-        if path.is_dir():
-            raise InputError(f"{path}: is a folder, and a file of this name would be written")
-        if path.exists() and not self.overwrite:
-            raise InputError(f"{path}: file exists, and is replaced only with --overwrite")
-
-    def write(self, run):
-        """Write all files; each is complete or not there.
-
-        Parameters
-        ----------
-        run : CalibrationRun
-            What was found.
-        """
-        from wpdc_gwcs.io import write, write_table
-
-        for calibration in run.calibrations:
-            stem = self.folder / calibration.frame
-            if calibration.sources is not None:
-                write_table(calibration.sources, f"{stem}.sources.ecsv", overwrite=self.overwrite)
-            write_table(calibration.matches, f"{stem}.matches.ecsv", overwrite=self.overwrite)
-            write(calibration, f"{stem}.wcs.asdf", overwrite=self.overwrite)
-        for name in run.failures:
-            # What an earlier run left for a frame that now fails would pass for its WCS.
-            for suffix in (".wcs.asdf", ".matches.ecsv", ".sources.ecsv"):
-                if self.overwrite:
-                    (self.folder / f"{name}{suffix}").unlink(missing_ok=True)
-        for detector, solution in run.solutions.items():
-            write(
-                solution,
-                self.folder / f"{file_stem(detector)}.solution.asdf",
-                overwrite=self.overwrite,
-            )
-        for solution in run.superseded.values():
-            write(solution, self.folder / superseded_name(solution), overwrite=self.overwrite)
-        for camera in run.cameras:
-            files = {d: f"{file_stem(d)}.solution.asdf" for d in camera.detectors}
-            write(
-                replace(camera, files=files),
-                self.folder / f"{file_stem(camera.name)}.camera.asdf",
-                overwrite=self.overwrite,
-            )
-        write_table(run.summary, self.folder / "summary.ecsv", overwrite=self.overwrite)
-
-
-def superseded_name(solution):
-    """Name of the file of a solution that no longer holds.
-
-    Parameters
-    ----------
-    solution : DistortionSolution
-        With the epoch until which it was valid.
-
-    Returns
-    -------
-    str
-        Such as ``ccd1.until-2024.5000.solution.asdf``.
-    """
-    return f"{file_stem(solution.detector)}.until-{solution.valid_to:.4f}.solution.asdf"
-
-
 def print_changes(run):
     """Print what an update has changed.
 
@@ -466,6 +363,8 @@ def print_changes(run):
         since = "" if last.get("first_epoch") is None else f" before {last['first_epoch']:.4f},"
         kept = ""
         if name in run.superseded:
+            from wpdc_gwcs.calibration.results import superseded_name
+
             kept = f"; the old solution is in {superseded_name(run.superseded[name])}"
         typer.echo(
             f"{name}: changed{since} by {last['rms_change_px']:.4f} px rms, "
@@ -474,30 +373,16 @@ def print_changes(run):
         )
 
 
-def file_stem(detector):
-    """Make a file name of a detector's name, whatever characters it has.
-
-    Parameters
-    ----------
-    detector : str
-        Name of the detector.
-
-    Returns
-    -------
-    str
-        Name without characters that a file system may refuse.
-    """
-    return "".join(c if c.isalnum() or c in "._-" else "_" for c in detector)
-
-
 @contextmanager
-def executor(address):
+def executor(address, timeout):
     """Connect to the Dask cluster at an address.
 
     Parameters
     ----------
     address : str or None
         Address of its scheduler.
+    timeout : float
+        Seconds to wait for the scheduler, and for a worker.
 
     Yields
     ------
@@ -513,12 +398,25 @@ def executor(address):
         raise InputError(
             "--scheduler needs Dask, which is not installed: pip install 'wpdc_gwcs[dask]'"
         ) from err
+    # What Dask has to say of lost connections goes to its own log; the outcome is told here.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    began = time.monotonic()
     try:
-        client = Client(address, timeout="10s")
-    except (OSError, ValueError) as err:
+        client = Client(address, timeout=timeout)
+    except (OSError, ValueError, TimeoutError) as err:
         raise InputError(f"--scheduler {address}: no Dask scheduler answers there: {err}") from err
     with client:
-        yield client.get_executor()
+        if not client.scheduler_info(n_workers=-1)["workers"]:
+            log.warning(
+                "%s: the Dask scheduler has no worker yet; waiting at most %g s", address, timeout
+            )
+            try:
+                client.wait_for_workers(1, timeout=max(timeout - time.monotonic() + began, 0.1))
+            except TimeoutError as err:
+                raise InputError(
+                    f"--scheduler {address}: must have a worker within {timeout:g} s, has none"
+                ) from err
+        yield client.get_executor(pure=False)
 
 
 def print_summary(run, folder):

@@ -8,7 +8,6 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
-from wpdc_gwcs.cli.calibrate import Results
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_plotting
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.exceptions import InputError
@@ -110,19 +109,21 @@ def demo_command(
     the output folder.  Exit status 1 if the WCS is off its own truth by more than 0.02 px rms.
     """
     from wpdc_gwcs.calibration import calibrate
-    from wpdc_gwcs.catalogs import read_catalog
     from wpdc_gwcs.io import read_frames
     from wpdc_gwcs.simulation import simulate
 
     require_plotting("the demo")
     began = time.perf_counter()
-    simulation = simulate(5, distortion=40.0, seed=seed)
+    try:
+        simulation = simulate(5, distortion=40.0, seed=seed)
+    except ValueError as err:
+        raise InputError(str(err)) from err
     files = write_files(simulation, output / "input", images=(0,), overwrite=overwrite)
     frames = [frame for path in files["frames"] for frame in read_frames(path)]
-    results = Results(output, frames, overwrite=overwrite)
     with progress_bar(quiet=quiet) as progress:
-        run = calibrate(frames, read_catalog(files["reference"]), progress=progress)
-    results.write(run)
+        run = calibrate(
+            frames, files["reference"], output=output, overwrite=overwrite, progress=progress
+        )
     for name, error in run.failures.items():
         typer.echo(f"wpdc: error: {name}: not solved: {error}", err=True)
     solved = {calibration.frame: calibration for calibration in run.calibrations}

@@ -1,4 +1,4 @@
-"""Commands on results: `export`, `pix2sky`, `sky2pix`, `evaluate`, `monitor`, `report`."""
+"""Commands on results: `pix2sky`, `sky2pix`, `evaluate`, `monitor`."""
 
 from dataclasses import replace
 from functools import partial
@@ -12,8 +12,6 @@ from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free, require_plotting
 from wpdc_gwcs.exceptions import InputError
 
-FORMATS = ("fits", "cpdis", "head", "sip", "stock")
-
 CalibrationFile = Annotated[
     Path,
     typer.Argument(metavar="FILE", help="A *.wcs.asdf, *.solution.asdf or exported FITS file."),
@@ -26,35 +24,6 @@ Output = Annotated[
     Path | None,
     typer.Option("--output", metavar="FILE", help="Write the table here instead of printing it."),
 ]
-
-
-@app.command("export", no_args_is_help=True)
-def export_command(
-    file: CalibrationFile,
-    format: Annotated[
-        str,
-        typer.Option(
-            "--format",
-            metavar="{fits,cpdis,head,sip,stock}",
-            help="fits: TPV + table, exact; cpdis: for astropy.wcs; head: for SWarp, SCAMP; "
-            "sip: for DS9; stock: gwcs alone.",
-        ),
-    ],
-    output: Annotated[Path, typer.Option("--output", metavar="OUT", help="File to write.")],
-    overwrite: Overwrite = False,
-    verbose: Verbose = 0,
-    quiet: Quiet = False,
-):
-    """Write a calibrated WCS in a format that other programs read; say how far it deviates."""
-    from wpdc_gwcs.io import write
-
-    if format not in FORMATS:
-        raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
-    require_free(output, overwrite)
-    deviation = write(read_one(file), output, format=format, overwrite=overwrite)
-    if not quiet:
-        note = "" if deviation is None else f" (greatest deviation {deviation:.2g} px)"
-        typer.echo(f"{output}: written as {format}{note}")
 
 
 def read_one(file):
@@ -269,7 +238,13 @@ class _EvaluatedFrame:
         beside = path.with_name(f"{self.name}.wcs.asdf")
         self.calibration = None
         if with_calibration and beside.exists():
-            self.calibration = replace(read(beside), matches=self.matches)
+            calibration = read(beside)
+            runs = calibration.provenance.get("run"), self.matches.meta.get("run")
+            if runs[0] != runs[1]:
+                raise InputError(
+                    f"{path}: must be of the same run as {beside.name}, {runs[0]}, is of {runs[1]}"
+                )
+            self.calibration = replace(calibration, matches=self.matches)
 
     def flag(self, name):
         return np.asarray(self.matches[name], bool)
@@ -331,7 +306,7 @@ def match_files(paths):
 
 def _write_plots(frames, compared, folder, *, overwrite):
     from wpdc_gwcs import plotting
-    from wpdc_gwcs.cli.calibrate import file_stem
+    from wpdc_gwcs.calibration.results import file_stem
 
     figures = {}
     for frame in frames:
@@ -415,33 +390,3 @@ def monitor_command(
             )
     if drift.drifted:
         raise typer.Exit(1)
-
-
-@app.command("report", no_args_is_help=True)
-def report_command(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of wpdc calibrate.")],
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", metavar="FILE", help="Page to write; default: DIR/report.html."),
-    ] = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-):
-    """Write one self-contained HTML page about a result folder: summary, tables, residuals."""
-    from wpdc_gwcs.cli.calibrate import write_page
-    from wpdc_gwcs.io import read, read_matches, read_table
-
-    require_plotting("the report")
-    output = folder / "report.html" if output is None else output
-    require_free(output, overwrite)
-    summary = read_table(folder / "summary.ecsv")
-    tables = {
-        name: read_matches(folder / f"{name}.matches.ecsv")
-        for name in summary["frame"][summary["status"] == "solved"]
-    }
-    found = [read(path) for path in sorted(folder.glob("*.solution.asdf"))]
-    # What an update has superseded lies beside what is valid now.
-    found.sort(key=lambda solution: solution.valid_to is None)
-    write_page(summary, {s.detector: s for s in found}, tables, output, overwrite=overwrite)
-    if not quiet:
-        typer.echo(f"{output}: report of {len(summary)} frames")

@@ -15,16 +15,23 @@ from wpdc_gwcs.exceptions import InputError
 __all__ = [
     "Config",
     "Epoch",
+    "Gain",
+    "Mask",
+    "MaskBits",
+    "MaxMag",
+    "MaxRoundness",
     "MinSNR",
     "Origin",
     "Overwrite",
     "PixelScale",
     "Preset",
     "Quiet",
+    "Saturation",
     "Threshold",
     "Verbose",
     "by_hand",
     "state_first_pixel",
+    "WeightMap",
     "require_free",
     "require_plotting",
 ]
@@ -153,6 +160,43 @@ Origin = Annotated[
     typer.Option(
         metavar="{0,1}",
         help="Number of the first pixel in tables of sources; default: as they tell, else 0.",
+    ),
+]
+
+MaxRoundness = Annotated[
+    float,
+    typer.Option(
+        metavar="R", help="Greatest difference from the roundness that the frame's stars have."
+    ),
+]
+MaxMag = Annotated[
+    float | None,
+    typer.Option(metavar="MAG", help="Magnitude of the faintest reference stars used."),
+]
+Gain = Annotated[
+    float | None,
+    typer.Option(metavar="E/COUNT", help="Electrons per count, in place of the header's."),
+]
+Saturation = Annotated[
+    float | None,
+    typer.Option(metavar="COUNTS", help="Level of saturated pixels, in place of the header's."),
+]
+Mask = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE[EXT]", help="Pixels that must not be used, in place of the file's own."
+    ),
+]
+MaskBits = Annotated[
+    int | None,
+    typer.Option(
+        metavar="SUM", help="Bits of masks that are bad; default: those that the pixels bear out."
+    ),
+]
+WeightMap = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE[EXT]", help="Inverse variances of the sky, in place of the file's own."
     ),
 ]
 

@@ -10,13 +10,20 @@ from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.calibrate import Catalog, WcsFile
 from wpdc_gwcs.cli.options import (
     Epoch,
+    Gain,
+    Mask,
+    MaskBits,
+    MaxMag,
+    MaxRoundness,
     MinSNR,
     Origin,
     Overwrite,
     PixelScale,
     Quiet,
+    Saturation,
     Threshold,
     Verbose,
+    WeightMap,
     by_hand,
     require_free,
     state_first_pixel,
@@ -28,17 +35,15 @@ log = logging.getLogger("wpdc_gwcs.cli")
 Table = Annotated[Path, typer.Option("--output", metavar="FILE", help="Table to write (ECSV).")]
 
 
-def one_frame(path, *, wcs=None, **given):
+def one_frame(path, **options):
     """Read the single frame of a file.
 
     Parameters
     ----------
     path : str
         FITS image or source list; ``path[EXT]`` chooses an extension.
-    wcs : str, optional
-        Starting WCS of a source table.
-    **given
-        What else `wpdc_gwcs.io.read_frames` takes.
+    **options
+        As for `wpdc_gwcs.io.read_frames`.
 
     Returns
     -------
@@ -47,7 +52,7 @@ def one_frame(path, *, wcs=None, **given):
     """
     from wpdc_gwcs.io import read_frames
 
-    frames = read_frames(path, wcs=wcs, **given)
+    frames = read_frames(path, **options)
     if len(frames) > 1:
         names = ", ".join(frame.source for frame in frames)
         raise InputError(f"{path}: has {len(frames)} frames, choose one with path[EXT]: {names}")
@@ -63,6 +68,11 @@ def detect_command(
     ] = "psf",
     threshold: Threshold = 5.0,
     min_snr: MinSNR = 10.0,
+    gain: Gain = None,
+    saturation: Saturation = None,
+    mask: Mask = None,
+    mask_bits: MaskBits = None,
+    weight_map: WeightMap = None,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
@@ -73,10 +83,17 @@ def detect_command(
 
     require_free(output, overwrite)
     try:
-        settings = Settings(centroids=centroids, threshold=threshold, min_snr=min_snr)
+        settings = Settings(
+            centroids=centroids,
+            threshold=threshold,
+            min_snr=min_snr,
+            gain=gain,
+            saturation=saturation,
+        )
     except ValueError as err:
         raise InputError(str(err)) from err
-    sources = measure_sources(one_frame(frame), settings)
+    planes = {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
+    sources = measure_sources(one_frame(frame, **planes), settings)
     write_table(sources, output, overwrite=overwrite)
     if not quiet:
         clean = int((sources["flags"] == 0).sum())
@@ -95,6 +112,14 @@ def match_command(
     epoch: Epoch = None,
     pixel_scale: PixelScale = None,
     origin: Origin = None,
+    min_snr: MinSNR = 10.0,
+    max_roundness: MaxRoundness = 0.3,
+    max_mag: MaxMag = None,
+    gain: Gain = None,
+    saturation: Saturation = None,
+    mask: Mask = None,
+    mask_bits: MaskBits = None,
+    weight_map: WeightMap = None,
     blind: Annotated[
         bool,
         typer.Option(
@@ -114,9 +139,22 @@ def match_command(
     from wpdc_gwcs.matching import pair_table
 
     require_free(output, overwrite)
-    one = one_frame(frame, wcs=wcs, **by_hand(epoch, pixel_scale, origin))
+    try:
+        settings = Settings(
+            blind=blind,
+            min_snr=min_snr,
+            max_roundness=max_roundness,
+            max_mag=max_mag,
+            gain=gain,
+            saturation=saturation,
+        )
+    except ValueError as err:
+        raise InputError(str(err)) from err
+    given = by_hand(epoch, pixel_scale, origin)
+    given |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
+    one = one_frame(frame, wcs=wcs, **given)
     reference = read_catalog(catalog)
-    matched = match_frame(one, reference, Settings(blind=blind))
+    matched = match_frame(one, reference, settings)
     if one.epoch is None and "pmra" in reference.colnames:
         log.warning("%s has no epoch: the stars' motions were not applied (--epoch)", one.source)
     i, j = matched.pairs

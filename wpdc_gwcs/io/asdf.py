@@ -5,11 +5,12 @@
     {"wcs": gwcs in stock models,
      "wpdc": {format_version, kind, ...}}
 
-Layout of ``wpdc``, format version 1.1.0 (arrays are core ASDF arrays, all else plain YAML):
+Layout of ``wpdc``, format version 1.2.0 (arrays are core ASDF arrays, all else plain YAML):
 
 ======================= ========================================================================
-``format_version``      "1.1.0"
+``format_version``      "1.2.0"
 ``kind``                "solution", "calibration" or "camera"
+``content_sum``         SHA-256 over names and values of all the rest, see `content_sum`
 ``software``            name and version of the writer
 ``solution``            the instrument, see below
 ``frame``               of a calibration: name of the frame, and with it ``crval``, ``cd``,
@@ -25,7 +26,7 @@ only), ``statistics``, ``settings``, ``provenance``, ``valid_from``, ``valid_to`
 ``wcs``; it has ``name``, ``detectors``, ``reference``, ``places``, ``matrices``, ``image_shapes``,
 ``cd``, ``learned``, ``files`` (detector to solution file beside it) and ``provenance``.  Matches
 and sources have tables of their own.  Files of version 1.0.0 open; the uncertainties of their
-frames are not known any more.
+frames are not known any more.  Those before 1.2.0 have no ``content_sum``.
 """
 
 import dataclasses
@@ -38,18 +39,19 @@ import numpy as np
 
 from wpdc_gwcs.camera import Camera
 from wpdc_gwcs.exceptions import FileFormatError, InputError
-from wpdc_gwcs.io.files import READ_ERRORS, atomic_path, first_line
+from wpdc_gwcs.export import FORMAT_VERSION
+from wpdc_gwcs.io.files import READ_ERRORS, as_utf8, atomic_path, first_line
+from wpdc_gwcs.io.integrity import check_size, check_version, content_sum
 from wpdc_gwcs.lookup import ResidualMap
 from wpdc_gwcs.models import LookupTable, PVPolynomial
 from wpdc_gwcs.solution import Calibration, DistortionSolution
 
-__all__ = ["FORMAT_VERSION", "read_asdf", "read_asdf_wcs", "write_asdf", "write_stock"]
+__all__ = ["read_asdf", "read_asdf_wcs", "sum_of", "write_asdf", "write_stock"]
 
-FORMAT_VERSION = "1.1.0"
 # Tables with files of their own, and what only the file of the detector itself needs.
 _NOT_STORED = {"matches", "sources"}
 _NOT_IN_FRAMES = {"residual_map"}
-_SHAPES = {"crpix": (2,), "crval": (2,), "cd": (2, 2)}
+_FIRST_WITH_SUM = (1, 2)
 
 
 def write_asdf(obj, path, *, overwrite=False):
@@ -78,7 +80,7 @@ def write_asdf(obj, path, *, overwrite=False):
         if set(obj.files) != set(obj.detectors):
             raise InputError(f"{path}: a camera must name the solution file of each detector")
         tree |= {"kind": "camera", "software": software, **_fields_of(obj, {"solutions"})}
-        _write_tree({"wpdc": tree}, path, overwrite)
+        _write_tree({"wpdc": _summed(tree)}, path, overwrite)
         return
     if isinstance(obj, Calibration):
         tree |= {"kind": "calibration", "software": software, **_fields_of(obj, _NOT_STORED)}
@@ -86,7 +88,8 @@ def write_asdf(obj, path, *, overwrite=False):
         tree |= {"kind": "solution", "software": software, "solution": _fields_of(obj, set())}
     # A residual map is mostly empty bins.
     compression = "zlib" if getattr(obj, "residual_map", None) is not None else None
-    _write_tree({"wcs": to_stock_wcs(obj.wcs), "wpdc": tree}, path, overwrite, compression)
+    trees = {"wcs": to_stock_wcs(obj.wcs), "wpdc": _summed(tree)}
+    _write_tree(trees, path, overwrite, compression)
 
 
 def write_stock(obj, path, *, overwrite=False):
@@ -107,13 +110,29 @@ def write_stock(obj, path, *, overwrite=False):
         Its greatest deviation from the exact WCS, px; `None` if the shape of the detector is
         unknown.
     """
-    from wpdc_gwcs.io.fits import deviation
+    from wpdc_gwcs.export import deviation
     from wpdc_gwcs.wcs import to_stock_wcs
 
     wcs = to_stock_wcs(obj.wcs)
     _write_tree({"wcs": wcs}, path, overwrite)
     shape = obj.solution.image_shape if isinstance(obj, Calibration) else obj.image_shape
     return None if shape is None else deviation(obj, wcs, n=101)
+
+
+def sum_of(obj):
+    """Sum over all that is in a result.
+
+    Parameters
+    ----------
+    obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or `~wpdc_gwcs.Camera`
+        The result.
+
+    Returns
+    -------
+    sum : str
+        See `wpdc_gwcs.io.integrity.content_sum`.
+    """
+    return content_sum(_fields_of(obj, _NOT_STORED))
 
 
 def read_asdf(path):
@@ -135,15 +154,11 @@ def read_asdf(path):
     FileFormatError
         If the file is damaged, of a newer format version or not of this kind.
     """
-    # What follows the data is not needed to read them, but where it is cut, so may be anything.
-    with open(path, "rb") as file:
-        file.seek(max(0, Path(path).stat().st_size - 4096))
-        if not file.read().rstrip(b"\0\r\n ").endswith(b"..."):
-            raise FileFormatError(f"{path}: truncated ASDF file: must end with '...', does not")
-    tree = _read_entry(path, "wpdc")
+    tree = _read_entry(path, "wpdc", whole=True)
     if not isinstance(tree, dict):
         raise FileFormatError(f"{path}: must have a 'wpdc' tree, has none: not a wpdc_gwcs file")
-    _check_version(tree, path)
+    version = check_version(tree.get("format_version"), path)
+    _check_content(tree, version, path)
     kind = tree.get("kind")
     if kind not in ("solution", "calibration", "camera"):
         raise FileFormatError(
@@ -165,11 +180,8 @@ def read_asdf(path):
 def _read_camera(tree, path):
     camera = _object_of(Camera, {**tree, "solutions": {}}, path)
     solutions = {}
-    n = len(camera.detectors)
-    if set(camera.files) != set(camera.detectors) or not (
-        len(camera.places) == len(camera.matrices) == len(camera.image_shapes) == n
-    ):
-        raise FileFormatError(f"{path}: must have a place, a shape and a file for each detector")
+    if set(camera.files) != set(camera.detectors):
+        raise FileFormatError(f"{path}: must have a file for each detector")
     for name, shape in zip(camera.detectors, camera.image_shapes):
         file = Path(path).parent / camera.files[name]
         if not file.is_file():
@@ -210,26 +222,60 @@ def read_asdf_wcs(path):
     return wcs
 
 
+def _summed(tree):
+    return {**tree, "content_sum": content_sum(tree)}
+
+
+def _check_content(tree, version, path):
+    """Make sure that the values are those that were written; blocks have sums of their own."""
+    given = tree.pop("content_sum", None)
+    if given is None and version < _FIRST_WITH_SUM:
+        return
+    if given != content_sum(tree):
+        raise FileFormatError(
+            f"{path}: damaged ASDF file: the values do not agree with their 'content_sum'"
+        )
+
+
 def _write_tree(tree, path, overwrite, compression=None):
     # A context copies what is loaded: extensions are to be looked for once, not for every file.
     _ = asdf.get_config().extensions
-    with atomic_path(path, overwrite=overwrite) as temporary, asdf.config_context() as config:
+    with (
+        atomic_path(path, overwrite=overwrite) as temporary,
+        asdf.config_context() as config,
+        # Open, because asdf takes a path for a URL, in which '#', '?', ';' and '%' end the name.
+        open(temporary, "wb") as stream,
+    ):
         # Small arrays stay legible.
         config.array_inline_threshold = 64
-        asdf.AsdfFile(tree).write_to(temporary, all_array_compression=compression)
+        asdf.AsdfFile(tree).write_to(stream, all_array_compression=compression)
 
 
-def _read_entry(path, key):
+def _read_entry(path, key, *, whole=False):
     """Read one entry of the tree and leave the others alone, which may be of newer libraries."""
     try:
-        with warnings.catch_warnings():
+        # Absolute, since a leading '~' is not a name to asdf, even if the file is open.
+        with open(Path(path).absolute(), "rb") as stream, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with asdf.open(path, lazy_load=False, memmap=False, lazy_tree=True) as file:
+            if whole:
+                _check_end(stream, path)
+            check_size(stream, path)
+            with asdf.open(
+                stream, lazy_load=False, memmap=False, lazy_tree=True, validate_checksums=True
+            ) as file:
                 return _loaded(file.tree.get(key))
     except (asdf.exceptions.ValidationError, *READ_ERRORS) as problem:
         raise FileFormatError(
             f"{path}: damaged or truncated ASDF file: {first_line(problem)}"
         ) from problem
+
+
+def _check_end(stream, path):
+    """Find a file that is cut short, also where it is cut behind the data."""
+    stream.seek(max(0, stream.seek(0, 2) - 4096))
+    if not stream.read().rstrip(b"\0\r\n ").endswith(b"..."):
+        raise FileFormatError(f"{path}: truncated ASDF file: must end with '...', does not")
+    stream.seek(0)
 
 
 def _loaded(node):
@@ -239,23 +285,6 @@ def _loaded(node):
     if isinstance(node, Sequence) and not isinstance(node, str):
         return [_loaded(value) for value in node]
     return np.array(node) if isinstance(node, asdf.tags.core.NDArrayType) else node
-
-
-def _check_version(tree, path):
-    version = tree.get("format_version")
-    try:
-        given = tuple(int(part) for part in str(version).split("."))
-        if len(given) != 3:
-            raise ValueError(version)
-    except ValueError:
-        raise FileFormatError(
-            f"{path}: format_version must be like {FORMAT_VERSION!r}, got {version!r}"
-        ) from None
-    if given > tuple(int(part) for part in FORMAT_VERSION.split(".")):
-        raise FileFormatError(
-            f"{path}: format version must not be newer than {FORMAT_VERSION}, got {version}: "
-            "a newer wpdc_gwcs is needed"
-        )
 
 
 def _entry(tree, key, path):
@@ -280,12 +309,15 @@ def _fields_of(obj, left_out):
 
 def _plain(value, where):
     """Give a value as what core ASDF knows."""
-    if value is None or isinstance(value, str | bool | int | float):
+    if isinstance(value, np.generic):
+        # Also where it is a Python number, as float64 is.
+        return _plain(value.item(), where)
+    if isinstance(value, str):
+        return as_utf8(value)
+    if value is None or isinstance(value, bool | int | float):
         return value
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         return np.array(value)
-    if isinstance(value, np.generic):
-        return value.item()
     if isinstance(value, PVPolynomial):
         return {
             "degree": value.degree,
@@ -299,11 +331,11 @@ def _plain(value, where):
     if isinstance(value, ResidualMap):
         return _plain(value.to_tree(), where)
     if isinstance(value, Path):
-        return str(value)
+        return as_utf8(str(value))
     if dataclasses.is_dataclass(value):
         return _fields_of(value, set())
     if isinstance(value, dict):
-        return {str(k): _plain(v, f"{where}[{k!r}]") for k, v in value.items()}
+        return {as_utf8(str(k)): _plain(v, f"{where}[{k!r}]") for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
         return [_plain(v, f"{where}[{i}]") for i, v in enumerate(value)]
     raise TypeError(f"{where} must be made of plain values and arrays, got {type(value).__name__}")
@@ -319,14 +351,7 @@ def _object_of(cls, tree, path):
         if field.name not in tree and not required:
             continue
         value = _entry(tree, field.name, path)
-        if field.name in _SHAPES:
-            value = np.array(value, float)
-            if value.shape != _SHAPES[field.name] or not np.isfinite(value).all():
-                raise FileFormatError(
-                    f"{path}: {field.name} must be finite and of the shape {_SHAPES[field.name]}, "
-                    f"got {value.tolist()}"
-                )
-        elif value is not None and field.name in _READERS:
+        if value is not None and field.name in _READERS:
             value = _READERS[field.name](value)
         values[field.name] = value
     return cls(**values)
@@ -352,8 +377,4 @@ _READERS = {
     "field": _read_table,
     "residual_map": ResidualMap.from_tree,
     "detectors": tuple,
-    "places": lambda places: np.array(places, float).reshape(-1, 2),
-    "matrices": lambda matrices: np.array(matrices, float).reshape(-1, 2, 2),
-    "image_shapes": lambda shapes: np.array(shapes, int).reshape(-1, 2),
-    "image_shape": lambda shape: tuple(int(n) for n in shape),
 }

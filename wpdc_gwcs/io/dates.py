@@ -16,7 +16,7 @@ from wpdc_gwcs.exceptions import WPDCWarning
 from wpdc_gwcs.io.headers import header_text, header_value
 from wpdc_gwcs.io.timestamps import read_clock, read_timestamp
 
-__all__ = ["header_epoch", "header_start", "julian_year", "read_epoch"]
+__all__ = ["EXPOSURE_KEYS", "header_epoch", "header_start", "julian_year", "read_epoch"]
 
 _MJD_RANGE = (-5000.0, 105000.0)  # 1845 to 2146
 # Without the word MJD, a number in a keyword like EXPSTART is a date if it is one of 1982 to 2064.
@@ -64,7 +64,11 @@ _WORD = re.compile(
 _KEYWORD = re.compile(f"(?:{_DAY}|{_THING}|{_SCALE}|{'|'.join(_MOMENTS.values())})+")
 # Clocks that go with a date without one.
 _CLOCK_KEYS = ("TIME-OBS", "UTC-OBS", "UT", "UTC", "UT-OBS", "UTSTART", "UT-STR", "UTC-BEG")
-_EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE", "XPOSURE", "ITIME", "TELAPSE", "EXP_TIME", "ELAPTIME")
+#: Keywords of the exposure time.
+EXPOSURE_KEYS = (
+    *("EXPTIME", "EXPOSURE", "XPOSURE", "TEXPTIME", "EFFEXPTM", "ITIME", "TELAPSE", "EXP_TIME"),
+    "ELAPTIME",
+)
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,7 @@ def header_epoch(headers, *, name="header"):
     if system not in _TO_TT:
         problems.append(f"TIMESYS={system!r}")
     exposure = 0.0
-    for key in _EXPOSURE_KEYS:
+    for key in EXPOSURE_KEYS:
         value = next((v for h in headers if (v := header_value(h, key)) is not None), None)
         if value is not None:
             if isinstance(value, int | float) and 0.0 <= value < 1e6:

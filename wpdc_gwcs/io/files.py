@@ -6,6 +6,7 @@ import gzip
 import lzma
 import os
 import re
+import stat
 import uuid
 import warnings
 from pathlib import Path
@@ -18,16 +19,22 @@ from wpdc_gwcs.exceptions import FileFormatError, InputError
 __all__ = [
     "READ_ERRORS",
     "OutputExistsError",
+    "as_utf8",
     "atomic_path",
     "check_output",
     "file_kind",
     "first_line",
     "open_fits",
+    "open_stream",
+    "place",
     "split_extension",
     "stem_of",
 ]
 
 _BLOCK = 2880
+_LONGEST_ENDING = 16
+# The standard has no more axes, and no file system files of more bytes.
+_MOST_AXES, _MOST_BYTES = 999, 1 << 63
 _OPENERS = {"gzip": gzip.open, "bzip2": bz2.open, "xz": lzma.open}
 _MAGIC = (
     (b"\x1f\x8b", "gzip"),
@@ -41,6 +48,8 @@ _HEADER_NAME = re.compile(r"\.(a?head|hdr|txt)$", re.IGNORECASE)
 _STEM_SUFFIXES = re.compile(
     r"\.(fz|gz|bz2|xz|fits?|fts|cat|ldac|ecsv|csv|txt|dat|tbl|head|asdf)$", re.IGNORECASE
 )
+# Control characters, line ends of Unicode, and the bytes that Python keeps as lone surrogates.
+_UNFIT = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\udc80-\udcff]")
 
 
 class OutputExistsError(InputError, FileExistsError):
@@ -63,8 +72,30 @@ def first_line(error):
     return str(error).strip().split("\n")[0] or type(error).__name__
 
 
+def as_utf8(text):
+    r"""Give a text that every file can hold.
+
+    Parameters
+    ----------
+    text : str
+        Possibly a path with bytes that are not UTF-8, which Python keeps as lone surrogates.
+
+    Returns
+    -------
+    text : str
+        The same, with such bytes written out.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.io.files import as_utf8
+    >>> print(as_utf8("caf\udce9.fits"))
+    caf\udce9.fits
+    """
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 def stem_of(path):
-    """Give the name of a file without its folder and without the endings of data files.
+    r"""Give the name of a file without its folder and without the endings of data files.
 
     Parameters
     ----------
@@ -74,18 +105,24 @@ def stem_of(path):
     Returns
     -------
     stem : str
-        For example ``a``.
+        For example ``a``.  Control characters and bytes that are not UTF-8 are written as in URLs,
+        since tables and other files have to hold the name.
 
     Examples
     --------
     >>> from wpdc_gwcs.io.files import stem_of
     >>> stem_of("night1/a.1.fits.fz")
     'a.1'
+    >>> stem_of("two\nlines.fits")
+    'two%0Alines'
     """
     name = Path(path).name
     while (shorter := _STEM_SUFFIXES.sub("", name)) not in ("", name):
         name = shorter
-    return name
+    return _UNFIT.sub(
+        lambda found: "".join(f"%{b:02X}" for b in found[0].encode("utf-8", "surrogateescape")),
+        name,
+    )
 
 
 def file_kind(path, *, error=FileFormatError):
@@ -160,15 +197,25 @@ def open_fits(path, *, error=FileFormatError, lazy=False):
     calibration; so do not warn of one's own inside the block.
     """
     path = Path(path)
-    _check_once(path, error)
-    with warnings.catch_warnings():
+    number = _check_once(path, error)
+    # Open, so that it is closed whatever astropy makes of it, and '~' is a name like any other.
+    with warnings.catch_warnings(), open(path, "rb") as stream:
         warnings.simplefilter("ignore")
         try:
-            hdus = fits.open(path, memmap=False, lazy_load_hdus=lazy)
+            hdus = fits.open(stream, memmap=False, lazy_load_hdus=lazy)
         except READ_ERRORS as problem:
             raise error(f"{path}: damaged FITS file: {first_line(problem)}") from problem
         with hdus:
-            yield hdus
+            if not lazy and len(hdus) < number:
+                # astropy leaves out what it cannot read, and all behind it.
+                raise error(f"{path}: damaged FITS file: HDU {len(hdus)} cannot be read")
+            try:
+                yield hdus
+            except InputError:
+                raise
+            except READ_ERRORS as problem:
+                # Much of a header is read only when it is asked for.
+                raise error(f"{path}: damaged FITS file: {first_line(problem)}") from problem
 
 
 # Files that were found complete, as they were then: each frame of a mosaic opens its file anew.
@@ -181,9 +228,34 @@ def _check_once(path, error):
     except OSError:
         state = None
     seen = state and (state.st_size, state.st_mtime_ns)
-    if seen is None or _complete.get(path) != seen:
-        check_complete(path, error=error)
-        _complete[path] = seen
+    if seen is None or _complete.get(path, (None,))[0] != seen:
+        _complete[path] = seen, check_complete(path, error=error)
+    return _complete[path][1]
+
+
+@contextlib.contextmanager
+def open_stream(path, mode="rb", *, like=None):
+    """Open a file for its bytes, decompressed and compressed on the way.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    mode : {"rb", "wb"}, optional
+        To read or to write.
+    like : path-like, optional
+        File whose compression a new file gets; itself by default.
+
+    Yields
+    ------
+    stream : file object
+        Of the bytes before compression.
+    """
+    with open(path if like is None else like, "rb") as file:
+        start = file.read(9)
+    kind = next((k for magic, k in _MAGIC if start.startswith(magic)), None)
+    with _OPENERS.get(kind, open)(path, mode) as stream:
+        yield stream
 
 
 def check_complete(path, *, error=FileFormatError):
@@ -195,6 +267,11 @@ def check_complete(path, *, error=FileFormatError):
         FITS file, compressed as a whole or not.
     error : type, optional
         Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
+
+    Returns
+    -------
+    number : int
+        Number of HDUs.
 
     Raises
     ------
@@ -209,13 +286,14 @@ def check_complete(path, *, error=FileFormatError):
         kind = next((k for magic, k in _MAGIC if start.startswith(magic)), None)
         if kind in _OPENERS:
             with _OPENERS[kind](path, "rb") as file:
-                _walk(file, path, error, size=None)
+                number = _walk(file, path, error, size=None)
                 # The trailing checksum of the compressed stream counts too.
                 while file.read(1 << 24):
                     pass
         else:
             with open(path, "rb") as file:
-                _walk(file, path, error, size=path.stat().st_size)
+                number = _walk(file, path, error, size=path.stat().st_size)
+        return number
     except InputError:
         raise
     except READ_ERRORS as problem:
@@ -230,9 +308,13 @@ def _walk(file, path, error, size):
     while True:
         header = _read_mandatory(file, path, error, number)
         if header is None:
-            return
+            return number
         position += header.pop("length")
         bits = abs(header.get("BITPIX", 8))
+        for keyword, value in header.items():
+            most = _MOST_AXES if keyword == "NAXIS" else _MOST_BYTES
+            if keyword != "BITPIX" and not 0 <= value <= most:
+                raise error(f"{path}: {keyword} of HDU {number} must be 0 to {most}, is {value}")
         axes = [header.get(f"NAXIS{i + 1}", 0) for i in range(header.get("NAXIS", 0))]
         if header.get("GROUPS") and axes and axes[0] == 0:
             axes = axes[1:]
@@ -301,14 +383,58 @@ def check_output(path, *, overwrite):
         If the folder does not exist or cannot be written to.
     """
     path = Path(path)
-    if path.exists() and not overwrite:
-        raise OutputExistsError(f"{path}: file exists and is kept; overwriting must be asked for")
-    if path.is_dir():
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        mode = None
+    except (OSError, ValueError) as problem:
+        reason = getattr(problem, "strerror", None) or first_line(problem)
+        raise InputError(f"{path}: cannot be written: {reason}") from problem
+    if mode is not None and stat.S_ISDIR(mode):
         raise InputError(f"{path}: output must be a file, this is a folder")
+    if mode is not None and not stat.S_ISREG(mode):
+        # To replace a device by a file takes it from everyone.
+        raise InputError(f"{path}: output must be a file, this is a device, pipe or socket")
+    if mode is not None and not overwrite:
+        raise OutputExistsError(f"{path}: file exists and is kept; overwriting must be asked for")
     if not path.parent.is_dir():
         raise InputError(f"{path}: output folder must exist, found no {path.parent}")
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{path}: output folder must be writable, {path.parent} is not")
+
+
+def place(temporary, path, *, overwrite):
+    """Give a finished file its name.
+
+    Parameters
+    ----------
+    temporary : path-like
+        The file, on the same file system.
+    path : path-like
+        Its name.
+    overwrite : bool
+        Whether a file of this name may be replaced.
+
+    Raises
+    ------
+    OutputExistsError
+        If there is a file of this name that may not be replaced.
+    """
+    if overwrite:
+        os.replace(temporary, path)
+        return
+    try:
+        # Unlike a rename, a link never replaces what someone else wrote in the meantime.
+        os.link(temporary, path)
+    except FileExistsError:
+        raise OutputExistsError(
+            f"{path}: file exists and is kept; overwriting must be asked for"
+        ) from None
+    except OSError:
+        # File systems without hard links.
+        os.rename(temporary, path)
+    else:
+        os.unlink(temporary)
 
 
 @contextlib.contextmanager
@@ -337,25 +463,15 @@ def atomic_path(path, *, overwrite=False):
     """
     path = Path(path)
     check_output(path, overwrite=overwrite)
-    # The ending stays, since writers choose their format by it.
-    temporary = path.parent / f".{path.stem[:64]}.{uuid.uuid4().hex}.part{path.suffix}"
+    # The ending stays, since writers choose their format by it.  Absolute, since to some of them a
+    # leading '~' is not a name.
+    ending = path.suffix if len(os.fsencode(path.suffix)) <= _LONGEST_ENDING else ""
+    temporary = path.parent.absolute() / f".{uuid.uuid4().hex}.part{ending}"
     try:
         yield temporary
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
-        if overwrite:
-            os.replace(temporary, path)
-        else:
-            try:
-                # Unlike a rename, a link never replaces what someone else wrote in the meantime.
-                os.link(temporary, path)
-            except FileExistsError:
-                raise OutputExistsError(
-                    f"{path}: file exists and is kept; overwriting must be asked for"
-                ) from None
-            except OSError:
-                # File systems without hard links.
-                os.rename(temporary, path)
+        place(temporary, path, overwrite=overwrite)
     except InputError:
         raise
     except OSError as problem:

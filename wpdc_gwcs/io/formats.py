@@ -1,12 +1,14 @@
 """One way in and one way out for calibrations and solutions, whatever the format."""
 
+import warnings
 from pathlib import Path
 
 from astropy.io import fits
 from astropy.table import Table
 
 from wpdc_gwcs.camera import Camera
-from wpdc_gwcs.exceptions import FileFormatError
+from wpdc_gwcs.exceptions import FileFormatError, WPDCWarning
+from wpdc_gwcs.export import FORMS
 from wpdc_gwcs.io.celestial import parse_wcs
 from wpdc_gwcs.io.files import check_output, file_kind, split_extension
 from wpdc_gwcs.io.headers import header_text, read_headers
@@ -15,7 +17,7 @@ from wpdc_gwcs.io.tan import parse_tan
 __all__ = ["FORMATS", "read", "read_wcs", "write"]
 
 #: Formats of `write`.
-FORMATS = ("asdf", "fits", "cpdis", "head", "sip", "stock")
+FORMATS = ("asdf", *FORMS, "stock")
 _SUFFIXES = {".asdf": "asdf", ".fits": "fits", ".fit": "fits", ".head": "head", ".ecsv": "ecsv"}
 
 
@@ -119,12 +121,18 @@ def _wcs_of(header, name, path):
     if path is not None and file_kind(path) == "fits":
         from wpdc_gwcs.io.files import open_fits
 
-        with open_fits(path) as hdus:
-            return parse_wcs(header, hdus=hdus, name=name)
+        # While a file is open, no warning is shown: ours are repeated when it is closed.
+        with open_fits(path) as hdus, warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            wcs = parse_wcs(header, hdus=hdus, name=name)
+        for warning in seen:
+            if issubclass(warning.category, WPDCWarning):
+                warnings.warn(warning.message)
+        return wcs
     return parse_wcs(header, name=name)
 
 
-def write(obj, path, *, format=None, overwrite=False):
+def write(obj, path, *, format=None, degree=None, overwrite=False):
     """Write a calibration, a solution or a table, in one step: the whole file or none.
 
     Parameters
@@ -134,17 +142,19 @@ def write(obj, path, *, format=None, overwrite=False):
         written as ``asdf`` only.
     path : path-like
         File to write.
-    format : {"asdf", "fits", "cpdis", "head", "sip", "stock"}, optional
+    format : {"asdf", "fits", "cpdis", "tpv", "head", "sip", "tab", "stock"}, optional
         By default what the ending says: ``.asdf``, ``.fits``, ``.head``; ``.ecsv`` for tables.
+    degree : int, optional
+        Degree of the polynomials of the FITS formats; by default that of the solution for ``fits``
+        and ``cpdis``, the lowest that is good to 1e-3 px or nearly as good as any for the others.
     overwrite : bool, optional
         Whether an existing file may be replaced.
 
     Returns
     -------
     deviation : float or None
-        For ``cpdis``, ``head``, ``sip`` and ``stock``: greatest deviation from the exact WCS over
-        the detector, px (for ``head`` it is that of leaving out the look-up table).  `None` for the
-        exact formats.
+        Greatest deviation from the exact WCS over the detector, px; `None` for the exact formats,
+        ``asdf`` and ``fits`` without ``degree``.
 
     Raises
     ------
@@ -153,7 +163,7 @@ def write(obj, path, *, format=None, overwrite=False):
     InputError
         If the file cannot be written.
     ValueError
-        If the format is unknown.
+        If the format is unknown, or has no polynomials of this degree.
 
     Examples
     --------
@@ -176,15 +186,15 @@ def write(obj, path, *, format=None, overwrite=False):
         raise ValueError(f"a camera is written as 'asdf', got the format {format!r} for {path}")
     # Before the work, not after.
     check_output(path, overwrite=overwrite)
-    return _writer(format)(obj, path, overwrite=overwrite)
+    if format in FORMS:
+        from wpdc_gwcs.io.fits import write_form
 
-
-def _writer(format):
+        made = write_form(obj, path, form=format, degree=degree, overwrite=overwrite)
+        return made.deviation
+    if degree is not None:
+        raise ValueError(f"degree has no meaning for {format!r}, got {degree}")
     # asdf and gwcs take half a second to import: only where they are needed.
-    if format in ("asdf", "stock"):
-        from wpdc_gwcs.io import asdf
+    from wpdc_gwcs.io import asdf
 
-        return {"asdf": asdf.write_asdf, "stock": asdf.write_stock}[format]
-    from wpdc_gwcs.io import fits as formats
-
-    return getattr(formats, f"write_{format}")
+    writer = {"asdf": asdf.write_asdf, "stock": asdf.write_stock}[format]
+    return writer(obj, path, overwrite=overwrite)

@@ -20,7 +20,14 @@ from astropy.io import fits
 from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.io.celestial import parse_wcs
-from wpdc_gwcs.io.dates import header_epoch, header_start
+from wpdc_gwcs.io.companions import (
+    data_section,
+    given_plane,
+    load_mask,
+    load_weight,
+    pair_companions,
+)
+from wpdc_gwcs.io.dates import EXPOSURE_KEYS, header_epoch, header_start
 from wpdc_gwcs.io.exposures import camera_key, exposure_key, has_identifier
 from wpdc_gwcs.io.files import (
     READ_ERRORS,
@@ -38,6 +45,15 @@ from wpdc_gwcs.io.headers import (
     header_text,
     positive_number,
     read_headers,
+)
+from wpdc_gwcs.io.images import (
+    choose_plane,
+    image_gain,
+    image_saturation,
+    image_shape,
+    load_image,
+    planes_of,
+    split_plane,
 )
 from wpdc_gwcs.io.sources import (
     load_fits_sources,
@@ -61,17 +77,11 @@ _DETECTOR_KEYS = (
     "CCDID",
     "IMAGEID",
 )
-_GAIN_KEYS = ("GAIN", "EGAIN", "GAINA", "CCDGAIN", "ATODGAIN")
-_SATURATION_KEYS = ("SATURATE", "SATURATION", "SATURAT", "SATLEVEL", "SATURATA")
 _FACTS = {"filter": ("FILTER", "FILTER1", "BAND"), "object": ("OBJECT",), "date": ("DATE-OBS",)}
-# Extensions that go with an image and are none, though they carry its WCS.
-_COMPANIONS = re.compile(
-    r"(ERR(OR)?|DQ|WHT|WEIGHT|W(EIGHT)?MAP|MASK|BPM|VAR(IANCE)?|RMS|IVAR|INVVAR|UNC(ERT)?|FLAGS?|FLG"
-    r"|CON|CTX|D2IMARR|WCSDVARR|BACKGROUND|BKG|OOD)",
-    re.IGNORECASE,
-)
 # Camera of frames that are tied to others and do not name theirs.
 _CAMERA = "camera"
+# Companions that tell the noise of the sky, best first.
+_WEIGHTS = ("weight", "error", "variance")
 _NOT_NAMES = ("PRIMARY", "COMPRESSED_IMAGE", "")
 
 
@@ -87,6 +97,9 @@ def read_frames(
     epoch=None,
     pixel_scale=None,
     origin=None,
+    mask=None,
+    weight_map=None,
+    mask_bits=None,
 ):
     """Read the frames of a file.
 
@@ -94,8 +107,9 @@ def read_frames(
     ----------
     path : path-like
         FITS image (plain, tile-compressed, gzipped; one frame for each image extension with a
-        celestial WCS), ``path[EXT]`` with the number or name of an extension, FITS_LDAC source list
-        (one frame for each of its detectors), or a table of sources, which needs ``wcs``.
+        celestial WCS), ``path[EXT]`` with the number or name of an extension, ``path[EXT][plane]``
+        with the number of a plane of a cube (from zero; ``L``: the sum of all), FITS_LDAC source
+        list (one frame for each of its detectors), or a table of sources, which needs ``wcs``.
     wcs : path-like or `~astropy.io.fits.Header`, optional
         Header to use instead of the frame's own: FITS file, ``path[EXT]``, ``.head`` or other text
         file; of several headers, one for each frame.
@@ -116,6 +130,13 @@ def read_frames(
         Scale in arcsec / px, instead of the headers'.
     origin : {0, 1}, optional
         Number of the first pixel in tables of sources, instead of what they tell.
+    mask, weight_map : path-like, optional
+        FITS image, ``path`` or ``path[EXT]``, of the pixels that must not be used, and of inverse
+        variances, in place of those in the file; of several images, those with the names or the
+        numbers of the frames' extensions.
+    mask_bits : int, optional
+        Sum of the bits of masks that are bad.  By default those that the header names, or all but
+        those whose pixels are like the rest, or that mark sources.
 
     Returns
     -------
@@ -139,6 +160,11 @@ def read_frames(
     or the number of its extension appended.  The detector is that of ``DETECTOR``, ``DETNAME``,
     ``CCDNAME``, ``EXTNAME``, ... in this order; frames of one file are never one detector.
 
+    Extensions with masks, weights, errors, times and the like are no frames, but are used with the
+    image that they belong to (SCI, ERR, DQ and their relatives).  A mosaic of pixels behind
+    different filters, and an image of three planes that its header calls colors, are measured on
+    the sum of their light; of other cubes a plane has to be chosen.
+
     The camera is ``INSTRUME``, else ``TELESCOP``.  Frames of one camera are of one exposure if
     ``EXPNUM``, ``OBSID`` or the like is the same or, where there is none, the time at which they
     began; the frames of one file are so in any case, unless such an identifier differs.
@@ -147,10 +173,13 @@ def read_frames(
         raise ValueError(f"origin must be 0 or 1, got {origin!r}")
     if pixel_scale is not None and not 0 < pixel_scale < np.inf:
         raise ValueError(f"pixel_scale must be positive, in arcsec / px, got {pixel_scale!r}")
+    path, plane = split_plane(path)
     path, extension = split_extension(path)
     stem = stem_of(path) if name is None else str(name)
+    planes = {"mask": mask, "weight": weight_map}
     by_hand = {} if epoch is None else {"epoch": float(epoch)}
     if file_kind(path, error=FrameError) != "fits":
+        _refuse_planes(path, planes)
         frame = _read_text_table(
             path,
             wcs,
@@ -165,7 +194,7 @@ def read_frames(
         return [frame if camera else _on_its_own(frame)]
     headers = None if wcs is None else _given_headers(wcs)
     with open_fits(path, error=FrameError) as hdus:
-        chosen = _choose(hdus, path, extension)
+        chosen, companions = _choose(hdus, path, extension)
         if headers is not None and len(headers) not in (1, len(chosen)):
             raise FrameError(
                 f"{wcs}: must have one WCS header for each of the {len(chosen)} frames of {path}, "
@@ -175,7 +204,7 @@ def read_frames(
             raise FrameError(
                 f"{path}: has {len(chosen)} frames, one WCS header cannot be that of all"
             )
-        several = len(_choose(hdus, path, None, quiet=True)) > 1
+        several = len(_choose(hdus, path, None, quiet=True)[0]) > 1
         prepared = [
             _prepare(
                 hdus,
@@ -183,6 +212,7 @@ def read_frames(
                 kind,
                 index,
                 None if headers is None else headers[i],
+                plane=plane,
                 pixel_scale=pixel_scale,
                 origin=origin,
             )
@@ -192,6 +222,10 @@ def read_frames(
     for part in prepared:
         for message in part["warnings"]:
             warnings.warn(message)
+        if part["kind"] != "image":
+            _refuse_planes(part["where"], planes)
+        part["companions"] = _companions(part, companions, planes)
+        part["mask_bits"] = mask_bits
         label = part["label"] if several else ""
         frames.append(_frame_of(part, path, stem, label, detector, image_shape, exposure_keyword))
     frames = [replace(f, **by_hand) for f in _distinct(frames, prepared)]
@@ -214,55 +248,66 @@ def _given_headers(wcs):
 
 
 def _choose(hdus, path, extension, *, quiet=False):
-    """Which HDUs are frames: list of (kind, index)."""
+    """Which HDUs are frames: list of (kind, index), and what goes with the images."""
     lists = [i for i, hdu in enumerate(hdus) if hdu.name == "LDAC_OBJECTS"]
     images = [
-        i for i, hdu in enumerate(hdus) if hdu.is_image and _image_shape(hdu.header) is not None
+        i for i, hdu in enumerate(hdus) if hdu.is_image and image_shape(hdu.header) is not None
     ]
+    companions = pair_companions(hdus, images, path)
     tables = [i for i, h in enumerate(hdus) if isinstance(h, fits.BinTableHDU | fits.TableHDU)]
     tables = [i for i in tables if i not in images]
     if extension is not None:
         index = find_extension(hdus, extension, path, error=FrameError)
         if index in lists or index + 1 in lists:
-            return [("list", index if index in lists else index + 1)]
+            return [("list", index if index in lists else index + 1)], {}
         if index in images:
-            return [("image", index)]
+            return [("image", index)], companions
         if index in tables:
-            return [("table", index)]
+            return [("table", index)], {}
         raise FrameError(
             f"{path}[{extension}]: must be an image, a source list or a table, "
             f"is {type(hdus[index]).__name__} without data"
         )
     if lists:
-        return [("list", i) for i in lists]
-    main = [i for i in images if not _COMPANIONS.fullmatch(hdus[i].name)]
-    images = main or images
+        return [("list", i) for i in lists], {}
+    images = list(companions)
     if len(images) > 1:
         # Of several images, those without a WCS are something else (guiders, focus chips).
         images = [i for i in images if "CTYPE1" in hdus[i].header] or images[:1]
     if images:
-        return [("image", i) for i in images]
+        # Cubes beside images are something else too.
+        flat = [i for i in images if planes_of(hdus[i].header) == 1]
+        return [("image", i) for i in flat or images], companions
     sources = [i for i in tables if position_columns(hdus[i].columns.names) is not None]
     if sources:
-        return [("table", sources[0])]
+        return [("table", sources[0])], {}
     if quiet:
-        return []
+        return [], {}
     raise FrameError(
         f"{path}: must have an image, FITS_LDAC sources or a table with positions, "
         f"has {extension_names(hdus)}"
     )
 
 
-def _image_shape(header):
-    """Shape of a two-dimensional image (further axes of length one allowed), else `None`."""
-    n = header.get("NAXIS", 0)
-    axes = [header.get(f"NAXIS{i + 1}", 0) for i in range(n)]
-    if n < 2 or min(axes[:2]) < 1 or any(a != 1 for a in axes[2:]):
-        return None
-    return axes[1], axes[0]
+def _refuse_planes(where, given):
+    """Refuse masks and weights of what has no pixels."""
+    for path in given.values():
+        if path is not None:
+            raise FrameError(f"{where}: is a source list, which has no use for {path}")
 
 
-def _prepare(hdus, where, kind, index, given, *, pixel_scale, origin):
+def _companions(part, companions, given):
+    """Gather what goes with a frame: the planes given, else those of its own file."""
+    found = list(companions.get(part["index"], ()))
+    for role, path in given.items():
+        if path is None:
+            continue
+        found = [c for c in found if (c.role == "mask") != (role == "mask")]
+        found.append(given_plane(path, part["index"], part["label"], part["shape"], role))
+    return found
+
+
+def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
     """Everything that needs the open file: headers, WCS, names of columns."""
     hdu = hdus[index]
     header = hdu.header
@@ -294,9 +339,11 @@ def _prepare(hdus, where, kind, index, given, *, pixel_scale, origin):
         label = str(index)
     elif hdu.is_image and hdu.ver > 1:
         label += f"_{hdu.ver}"
-    shape = _image_shape(header) if kind == "image" else header_shape(header)
+    shape = image_shape(header) if kind == "image" else header_shape(header)
     if shape is None:
         shape = header_shape(wcs_header)
+    if kind == "image":
+        plane = choose_plane(header, plane, f"{where}" if "[" in where else f"{where}[{index}]")
     # While a file is open, no warning is shown: ours are repeated when it is closed.
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
@@ -310,6 +357,8 @@ def _prepare(hdus, where, kind, index, given, *, pixel_scale, origin):
     if kind == "table" and origin is None:
         origin = source_origin(hdu.columns.names, headers[:2])
     return {
+        "plane": plane,
+        "section": data_section(header, shape) if kind == "image" else None,
         "kind": kind,
         "index": index,
         "where": where,
@@ -341,7 +390,7 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
     headers, where, index = part["headers"], part["where"], part["index"]
     loaders = {}
     if part["kind"] == "image":
-        loaders["load_image"] = functools.partial(_load_image, str(path), index)
+        loaders = _image_loaders(part, str(path))
     else:
         loaders["load_sources"] = functools.partial(
             load_fits_sources, str(path), index, origin=part["origin"]
@@ -356,12 +405,42 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
         wcs=part["wcs"],
         epoch=header_epoch(headers, name=where),
         source=where,
-        gain=positive_number(headers, _GAIN_KEYS),
-        saturation=positive_number(headers, _SATURATION_KEYS),
+        gain=image_gain(headers),
+        saturation=image_saturation(headers),
         **_keys_of(headers, exposure_keyword, where),
-        meta=_facts(headers) | (_first_pixel(part["origin"]) if part["kind"] == "table" else {}),
+        meta=_facts(headers) | _choices(part),
+        inputs=tuple(c.path for c in part["companions"] if c.given),
         **loaders,
     )
+
+
+def _choices(part):
+    """State what of the file the frame is made of, where there was a choice."""
+    if part["kind"] == "table":
+        return _first_pixel(part["origin"])
+    if part["kind"] == "list":
+        return {}
+    facts = {c.role: f"{c.path}[{c.index}]" for c in part["companions"] if c.given}
+    if part["mask_bits"] is not None:
+        facts["mask_bits"] = part["mask_bits"]
+    return facts | ({"plane": part["plane"]} if part["plane"] != 0 else {})
+
+
+def _image_loaders(part, path):
+    """Loaders of pixels, mask and weight."""
+    shape = tuple(part["shape"])
+    load = functools.partial(load_image, path, part["index"], part["plane"])
+    loaders = {"load_image": load}
+    masks = [c for c in part["companions"] if c.role == "mask"]
+    if masks or part["section"] is not None:
+        loaders["load_mask"] = functools.partial(
+            load_mask, masks, part["section"], shape, part["mask_bits"], load
+        )
+    weights = {c.role: c for c in reversed(part["companions"]) if c.role in _WEIGHTS}
+    if weights:
+        best = min(weights, key=_WEIGHTS.index)
+        loaders["load_weight"] = functools.partial(load_weight, weights[best], shape)
+    return loaders
 
 
 def _keys_of(headers, exposure_keyword, where):
@@ -412,7 +491,7 @@ def _facts(headers):
         if text:
             facts[fact] = text
     numbers = {
-        "exptime": positive_number(headers, ("EXPTIME", "EXPOSURE")),
+        "exptime": positive_number(headers, EXPOSURE_KEYS),
         "start": header_start(headers),
     }
     return facts | {fact: n for fact, n in numbers.items() if n is not None}
@@ -441,27 +520,6 @@ def _distinct(frames, parts):
 
 def _file_name(text):
     return re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_") or "image"
-
-
-def _load_image(path, index):
-    """Read the pixels of one HDU: float, native byte order, blank pixels NaN."""
-    where = f"{path}[{index}]"
-    with open_fits(path, error=FrameError) as hdus:
-        hdu = hdus[index]
-        # Taken first: astropy drops them from the header when it scales.
-        blank = hdu.header.get("BLANK", hdu.header.get("ZBLANK"))
-        scale, zero = hdu.header.get("BSCALE", 1.0), hdu.header.get("BZERO", 0.0)
-        try:
-            data = hdu.data
-        except READ_ERRORS as problem:
-            raise FrameError(f"{where}: damaged image: {first_line(problem)}") from problem
-        data = data.reshape(data.shape[-2:])
-        if data.dtype.kind in "iub":
-            image = data.astype(np.float32 if data.dtype.itemsize <= 2 else np.float64)
-            if blank is not None:
-                image[data == blank * scale + zero] = np.nan
-            return image
-        return data.astype(np.float64 if data.dtype.itemsize == 8 else np.float32)
 
 
 def _read_text_table(

@@ -20,6 +20,7 @@ from wpdc_gwcs.catalogs import read_lines, read_table_file
 from wpdc_gwcs.columns import find_name, listed, read_numbers, spelled_names
 from wpdc_gwcs.copies import group_copies
 from wpdc_gwcs.exceptions import FrameError, WPDCWarning
+from wpdc_gwcs.flags import FLAG_BAD_PIXEL, FLAG_BLENDED, FLAG_EDGE, FLAG_SATURATED
 from wpdc_gwcs.io.files import READ_ERRORS, first_line, open_fits
 from wpdc_gwcs.io.headers import header_value
 
@@ -419,8 +420,6 @@ def _copies(sources):
 
 def _sextractor_flags(flags, external):
     """Translate FLAGS and IMAFLAGS_ISO of SExtractor."""
-    from wpdc_gwcs.detection import FLAG_BAD_PIXEL, FLAG_BLENDED, FLAG_EDGE, FLAG_SATURATED
-
     ours = np.zeros_like(flags)
     # 2 deblended, 4 saturated, 8 truncated, 16 aperture incomplete, above: memory overflows
     for theirs, flag in (

@@ -10,7 +10,7 @@ from astropy.table import Table
 
 from wpdc_gwcs.catalogs import read_table_file
 from wpdc_gwcs.exceptions import FileFormatError
-from wpdc_gwcs.io.files import READ_ERRORS, atomic_path, file_kind, first_line
+from wpdc_gwcs.io.files import READ_ERRORS, as_utf8, atomic_path, file_kind, first_line
 
 __all__ = ["read_matches", "read_table", "write_table"]
 
@@ -53,7 +53,7 @@ def write_table(table, path, *, overwrite=False):
         # One row of header is what names the columns in ECSV.
         text = _text_of(plain[:0]) + _rows_of(plain)
     with atomic_path(path, overwrite=overwrite) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(as_utf8(text), encoding="utf-8")
 
 
 def read_table(path, *, columns=()):
@@ -82,7 +82,7 @@ def read_table(path, *, columns=()):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if kind == "fits":
-                table = Table.read(path, format="fits")
+                table = Table.read(path.absolute(), format="fits")
             else:
                 table = read_table_file(path)
     except READ_ERRORS as problem:

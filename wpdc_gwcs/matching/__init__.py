@@ -55,11 +55,12 @@ pointing and scale.
 from wpdc_gwcs.matching._core import match_planes
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._evidence import AreaEvidence
-from wpdc_gwcs.matching._high_level import match_sources, pair_table, select_sources
+from wpdc_gwcs.matching._high_level import match_sources, pair_table
 from wpdc_gwcs.matching._mapping import SmoothMap
 from wpdc_gwcs.matching._nearby import match_nearby
 from wpdc_gwcs.matching._options import MatchOptions
 from wpdc_gwcs.matching._pairs import pair_nearest
+from wpdc_gwcs.selection import select_sources
 
 __all__ = [
     "AreaEvidence",

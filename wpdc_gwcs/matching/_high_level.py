@@ -10,9 +10,10 @@ from wpdc_gwcs.columns import convert, read_numbers, unit_of
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._core import match_planes
 from wpdc_gwcs.models import local_plane, project
+from wpdc_gwcs.selection import MAX_ROUNDNESS, MIN_SNR, judge_sources, left_out
 from wpdc_gwcs.sky import move
 
-__all__ = ["match_sources", "pair_table", "select_sources"]
+__all__ = ["match_sources", "pair_table"]
 
 
 def match_sources(
@@ -22,8 +23,9 @@ def match_sources(
     *,
     image_shape=None,
     epoch=None,
-    max_roundness=0.3,
-    min_snr=10.0,
+    max_roundness=MAX_ROUNDNESS,
+    min_snr=MIN_SNR,
+    max_mag=None,
     **options,
 ):
     """Match detected sources to a reference catalogue.
@@ -46,7 +48,9 @@ def match_sources(
         Epoch of the frame in Julian years, to which the catalogue is moved.  By default the
         catalogue is taken as it is.
     max_roundness, min_snr : float
-        Sources less round than this or of lower signal-to-noise take no part, nor do flagged ones.
+        Which sources take part, see `select_sources`.
+    max_mag : float, optional
+        Magnitude of the faintest reference stars that take part.
     **options
         Choices of `MatchOptions`: how far is searched, what evidence is needed.
 
@@ -93,15 +97,17 @@ def match_sources(
     x, y = columns["x"], columns["y"]
     if image_shape is None:
         image_shape = _find_shape(wcs, x, y)
-    rows = np.flatnonzero(_is_clean(columns, max_roundness, min_snr))
+    rules = judge_sources(columns, max_roundness=max_roundness, min_snr=min_snr)
+    rows = np.flatnonzero(~np.any(list(rules.values()), axis=0))
     if len(rows) == 0:
-        raise MatchError(
-            f"none of {len(x)} sources has a finite position and is round, clean and bright enough"
-        )
+        raise MatchError(f"none of {len(x)} sources can be used: {left_out(rules)}")
     pixels = _tangent_plane(wcs, image_shape)
     sky = wcs.pixel_to_world(x[rows], y[rows]).icrs
     xs, ys = pixels(sky.ra.deg, sky.dec.deg)
     xr, yr = pixels(ra, dec)
+    if max_mag is not None and mag is not None:
+        # Rows stay in their places: what is not on the plane takes no part.
+        xr = np.where(mag > max_mag, np.nan, xr)
 
     def part(name):
         return None if columns[name] is None else columns[name][rows]
@@ -129,35 +135,6 @@ def match_sources(
         reference=(xr[j], yr[j]),
     )
     return matches, diagnostics
-
-
-def select_sources(sources, *, max_roundness=0.3, min_snr=10.0):
-    """Mark the sources that take part in a match: with a position, clean, round, bright enough.
-
-    Parameters
-    ----------
-    sources : `~astropy.table.Table`
-        As for `match_sources`.
-    max_roundness, min_snr : float
-        Largest absolute roundness and least signal-to-noise ratio.
-
-    Returns
-    -------
-    (N,) ndarray of bool
-        True for those that take part.
-    """
-    return _is_clean(_read_sources(sources, None), max_roundness, min_snr)
-
-
-def _is_clean(columns, max_roundness, min_snr):
-    use = np.isfinite(columns["x"]) & np.isfinite(columns["y"])
-    if columns["roundness"] is not None:
-        use &= ~(np.abs(columns["roundness"]) > max_roundness)
-    if columns["snr"] is not None:
-        use &= ~(columns["snr"] < min_snr)
-    if columns["flags"] is not None:
-        use &= columns["flags"] == 0
-    return use
 
 
 def pair_table(diagnostics, *, source_index, catalog_index, detector, sky, start, reference):

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
+from astropy.utils.masked import Masked
 
 __all__ = ["BLOCK_SIZE", "evaluate_blocks", "run_blocks"]
 
@@ -88,15 +89,19 @@ def evaluate_blocks(function, *inputs, n_outputs=2):
     function : callable
         Takes contiguous 1-D float64 arrays and returns ``n_outputs`` arrays of the same length.
     *inputs : array_like
-        Mutually broadcastable; scalars, empty and multi-dimensional arrays are welcome.
+        Mutually broadcastable; scalars, empty and multi-dimensional arrays are welcome.  What is
+        masked in one of them is masked in all outputs.
     n_outputs : int, optional
         Number of outputs.
 
     Returns
     -------
     outputs : tuple of ndarray
-        Of the broadcast shape of the inputs (zero-dimensional for scalars).
+        Of the broadcast shape of the inputs (zero-dimensional for scalars).  Masked arrays, of
+        numpy or of astropy, if an input is one.
     """
+    if any(hasattr(value, "mask") for value in inputs):
+        return _evaluate_masked(function, inputs, n_outputs)
     inputs = [np.asarray(value) for value in inputs]
     if any(value.shape != inputs[0].shape for value in inputs):
         inputs = np.broadcast_arrays(*inputs)
@@ -120,3 +125,18 @@ def evaluate_blocks(function, *inputs, n_outputs=2):
 
     run_blocks(run, size)
     return tuple(output.reshape(shape) for output in outputs)
+
+
+def _evaluate_masked(function, inputs, n_outputs):
+    """Evaluate what is under the masks, too, and put the masks of all inputs on the outputs."""
+    in_numpy = any(isinstance(value, np.ma.MaskedArray) for value in inputs)
+    masks = [np.asarray(getattr(value, "mask", False)) for value in inputs]
+    plain = [
+        value.data if isinstance(value, np.ma.MaskedArray) else getattr(value, "unmasked", value)
+        for value in inputs
+    ]
+    outputs = evaluate_blocks(function, *plain, n_outputs=n_outputs)
+    mask = np.broadcast_to(np.logical_or.reduce(np.broadcast_arrays(*masks)), outputs[0].shape)
+    if in_numpy:
+        return tuple(np.ma.array(output, mask=mask.copy()) for output in outputs)
+    return tuple(Masked(output, mask=mask.copy()) for output in outputs)

@@ -52,15 +52,48 @@ class _Scratch(threading.local):
 _scratch = _Scratch()
 
 
+def _locate(x, low, step, n):
+    s = x - low
+    s *= 1.0 / step
+    i = np.floor(s)
+    # The ring of outer cells takes what is beyond, NaN stays NaN in s.
+    np.maximum(i, -1.0, out=i)
+    np.minimum(i, n, out=i)
+    s -= i
+    i += 1.0
+    return i, s
+
+
+def _with_outer_cells(coefficients, power_axis, cell_axis):
+    """Add a cell at both ends of an axis that goes on with the value and the slope of the edge."""
+    inner = np.moveaxis(coefficients, (power_axis, cell_axis), (0, 1))
+    outer = np.zeros((len(inner), 2, *inner.shape[2:]))
+    powers = np.arange(len(inner)).reshape((-1,) + (1,) * (inner.ndim - 2))
+    first, last = inner[:, 0], inner[:, -1]
+    # The first outer cell ends at its s = 1, the last one begins at its s = 0.
+    outer[0, 0], outer[1, 0] = first[0] - first[1], first[1]
+    outer[0, 1], outer[1, 1] = last.sum(axis=0), (powers * last).sum(axis=0)
+    whole = np.concatenate([outer[:, :1], inner, outer[:, 1:]], axis=1)
+    return np.moveaxis(whole, (0, 1), (power_axis, cell_axis))
+
+
 class CellGrid:
     """Equally spaced cells, each with its own polynomial in local coordinates from 0 to 1.
+
+    ::
+
+        outer | cells of the grid, numbered from 1 | outer
+        s < 1 |          0 <= s < 1                | 0 <= s
+
+    Around them is a ring of outer cells without end, so that there are values everywhere.
 
     Parameters
     ----------
     x_range, y_range : (float, float)
-        First and last edge.
-    coefficients : (2, n, n, ny, nx) ndarray
-        ``coefficients[k, p, q, j, i]`` multiplies ``s**p t**q`` in output k in cell (j, i).
+        First and last edge, of the cells without the ring.
+    coefficients : (2, n, n, ny + 2, nx + 2) ndarray
+        ``coefficients[k, p, q, j, i]`` multiplies ``s**p t**q`` in output k in cell (j, i), the
+        ring of outer cells included.
     smooth : bool, keyword-only
         Whether the first derivatives are continuous from cell to cell.
     """
@@ -69,13 +102,34 @@ class CellGrid:
         self.smooth = smooth
         self.x_low, self.x_high = (float(edge) for edge in x_range)
         self.y_low, self.y_high = (float(edge) for edge in y_range)
-        self.ny, self.nx = coefficients.shape[-2:]
+        self.ny, self.nx = (n - 2 for n in coefficients.shape[-2:])
         self.x_step = (self.x_high - self.x_low) / self.nx
         self.y_step = (self.y_high - self.y_low) / self.ny
         n = coefficients.shape[1]
         # rows[q, k, cell, p]: the four powers of s side by side, since fetching them 32 bytes at a
         # time is what costs least, and both outputs in one array, for half as many calls.
         self.rows = np.ascontiguousarray(coefficients.reshape(2, n, n, -1).transpose(2, 0, 3, 1))
+
+    @classmethod
+    def continued(cls, x_range, y_range, coefficients, *, smooth):
+        """Return a grid that goes on outside its cells in straight lines.
+
+        Parameters
+        ----------
+        x_range, y_range : (float, float)
+            First and last edge.
+        coefficients : (2, n, n, ny, nx) ndarray
+            Of the cells, without the ring.
+        smooth : bool
+            Whether the first derivatives are continuous from cell to cell; they are into the ring.
+
+        Returns
+        -------
+        grid : CellGrid
+            With values everywhere.
+        """
+        along_x = _with_outer_cells(coefficients, power_axis=1, cell_axis=4)
+        return cls(x_range, y_range, _with_outer_cells(along_x, 2, 3), smooth=smooth)
 
     @property
     def x_range(self):
@@ -104,61 +158,72 @@ class CellGrid:
 
     @property
     def coefficients(self):
-        """The coefficients the grid was made of, ``[k, p, q, j, i]``."""
+        """The coefficients the grid was made of, ``[k, p, q, j, i]``, with the outer cells."""
         n = len(self.rows)
-        return self.rows.transpose(1, 3, 0, 2).reshape(2, n, n, self.ny, self.nx)
+        return self.rows.transpose(1, 3, 0, 2).reshape(2, n, n, self.ny + 2, self.nx + 2)
 
-    def locate(self, x, y, margin=0.0):
-        """Return cell numbers, local coordinates and what is outside by more than the margin.
+    def locate_x(self, x):
+        """Return numbers along x, from 0 for the outer cell, and local coordinates.
+
+        Parameters
+        ----------
+        x : (N,) ndarray
+            Positions.
+        """
+        return _locate(x, self.x_low, self.x_step, self.nx)
+
+    def locate_y(self, y):
+        """Return numbers along y, from 0 for the outer cell, and local coordinates.
+
+        Parameters
+        ----------
+        y : (N,) ndarray
+            Positions.
+        """
+        return _locate(y, self.y_low, self.y_step, self.ny)
+
+    def number(self, j, i):
+        """Return the number of a cell from its numbers along both axes.
+
+        Parameters
+        ----------
+        j, i : (N,) ndarray
+            Numbers along y and x, as floats; they are overwritten.
+        """
+        j *= self.nx + 2
+        j += i
+        return j.astype(np.intp)
+
+    def locate(self, x, y):
+        """Return cell numbers and local coordinates.
 
         Parameters
         ----------
         x, y : (N,) ndarray
-            Positions on the grid.
-        margin : float, optional
-            Distance by which points may lie outside.
-
-        Notes
-        -----
-        ``outside`` is `None` when every point is inside.
+            Positions.
         """
-        x_low, x_high = self.x_low - margin, self.x_high + margin
-        y_low, y_high = self.y_low - margin, self.y_high + margin
-        outside = None
-        at_edge = margin > 0
-        if len(x):
-            x_most, y_most = x.max(), y.max()
-            # Written so that NaN counts as outside.
-            if not (
-                x.min() >= x_low and x_most <= x_high and y.min() >= y_low and y_most <= y_high
-            ):
-                good = (x >= x_low) & (x <= x_high)
-                good &= (y >= y_low) & (y <= y_high)
-                outside = ~good
-                x = np.where(good, x, self.x_low)
-                y = np.where(good, y, self.y_low)
-                at_edge = True
-            # Within rounding of the division into cells.
-            near = 1.0 - 1e-12
-            at_edge |= x_most >= self.x_low + near * (self.x_high - self.x_low)
-            at_edge |= y_most >= self.y_low + near * (self.y_high - self.y_low)
-        s = x - self.x_low
-        s *= 1.0 / self.x_step
-        t = y - self.y_low
-        t *= 1.0 / self.y_step
-        i, j = np.floor(s), np.floor(t)
-        if at_edge:
-            # The last edge belongs to the last cell, a margin to the outermost ones.
-            np.minimum(i, self.nx - 1, out=i)
-            np.minimum(j, self.ny - 1, out=j)
-        if margin:
-            np.maximum(i, 0, out=i)
-            np.maximum(j, 0, out=j)
-        s -= i
-        t -= j
-        j *= self.nx
-        j += i
-        return j.astype(np.intp), s, t, outside
+        i, s = self.locate_x(x)
+        j, t = self.locate_y(y)
+        return self.number(j, i), s, t
+
+    def outside(self, x, y):
+        """Tell which points are outside the cells; `None` when none is.
+
+        Parameters
+        ----------
+        x, y : (N,) ndarray
+            Positions; NaN is outside.
+        """
+        if not len(x) or (
+            x.min() >= self.x_low
+            and x.max() <= self.x_high
+            and y.min() >= self.y_low
+            and y.max() <= self.y_high
+        ):
+            return None
+        inside = (x >= self.x_low) & (x <= self.x_high)
+        inside &= (y >= self.y_low) & (y <= self.y_high)
+        return ~inside
 
     def evaluate(self, cell, s, t):
         """Return both outputs.
@@ -291,10 +356,10 @@ class CellGrid:
             "pa,qb,kjbia->kpqji", powers, powers, values - first, optimize=True
         )
         coefficients[:, 0, 0] += first[:, :, 0, :, 0]
-        return CellGrid(self.x_range, self.y_range, coefficients, smooth=False)
+        return CellGrid.continued(self.x_range, self.y_range, coefficients, smooth=False)
 
     def curvature(self):
-        """Return a bound M of the second derivatives.
+        """Return a bound M of the second derivatives inside the cells.
 
         A step (dx, dy) of Newton's method leaves a residual of at most ``M (dx**2 + dy**2) / 2`` in
         either output.  Infinite where the first derivatives jump from cell to cell.
@@ -303,7 +368,7 @@ class CellGrid:
             return np.inf
         n = len(self.rows)
         p, q = np.arange(n)[:, np.newaxis, np.newaxis, np.newaxis], np.arange(n)[:, None, None]
-        size = np.abs(self.coefficients)
+        size = np.abs(self.coefficients[..., 1:-1, 1:-1])
         along_x = (size * p * (p - 1)).sum(axis=(1, 2)).max() / self.x_step**2
         along_y = (size * q * (q - 1)).sum(axis=(1, 2)).max() / self.y_step**2
         mixed = (size * p * q).sum(axis=(1, 2)).max() / (self.x_step * self.y_step)
@@ -330,15 +395,15 @@ class CellGrid:
             (self.x_low, self.x_step, self.nx, origin[0]),
             (self.y_low, self.y_step, self.ny, origin[1]),
         ):
-            edge = low - centre + step * np.arange(n)
-            shift = np.zeros((n, m, m))
+            edge = low - centre + step * np.arange(-1, n + 1)
+            shift = np.zeros((n + 2, m, m))
             for p in range(m):
                 for a in range(p + 1):
                     shift[:, a, p] = math.comb(p, a) * edge ** (p - a) * step**a
             shifts.append(shift)
         local = np.einsum("iap,jbq,kpq->kabji", *shifts, polynomial, optimize=True)
         n = len(self.rows)
-        total = np.zeros((2, 4, 4, self.ny, self.nx))
+        total = np.zeros((2, 4, 4, self.ny + 2, self.nx + 2))
         total[:, :n, :n] += self.coefficients
         total[:, :m, :m] += local
         return CellGrid(self.x_range, self.y_range, total, smooth=self.smooth)
@@ -369,4 +434,4 @@ def spline_cells(x_grid, y_grid, values):
     y_scale = (y_grid[1] - y_grid[0]) ** np.arange(4)
     scale = x_scale[:, np.newaxis] * y_scale
     coefficients = coefficients * scale[..., np.newaxis, np.newaxis]
-    return CellGrid(x_grid[[0, -1]], y_grid[[0, -1]], coefficients, smooth=True)
+    return CellGrid.continued(x_grid[[0, -1]], y_grid[[0, -1]], coefficients, smooth=True)

@@ -58,7 +58,7 @@ class DistortionCorrection(Model):
     evaluated in one pass: in each cell of the table the whole of it is one bicubic polynomial.
     `DetectorToSky` takes the tangent plane into the same pass.
 
-    Outside the table's nodes it is NaN; without a table it is defined everywhere.
+    It is defined everywhere; outside its nodes the table goes on in straight lines.
 
     Examples
     --------
@@ -110,6 +110,13 @@ class DistortionCorrection(Model):
     def __getstate__(self):
         # The folded coefficients are worked out again where they are needed.
         return {**self.__dict__, "_cache": None}
+
+    def __repr__(self):
+        parts = {"pv": self._pv, "lookup_table": self._lookup_table}
+        return self._format_repr(kwargs={k: v for k, v in parts.items() if v is not None})
+
+    def __str__(self):
+        return self._format_str([("PV", repr(self._pv)), ("Table", repr(self._lookup_table))])
 
     @property
     def pv(self):
@@ -191,7 +198,7 @@ class DistortionCorrection(Model):
         Returns
         -------
         x, y : ndarray
-            Undistorted pixel coordinates, zero based; NaN outside the table.
+            Undistorted pixel coordinates, zero based.
         """
         return evaluate_blocks(self._plane_map(crpix, cd), x, y)
 
@@ -222,7 +229,7 @@ class DistortionInverse(Model):
     """Undistorted to detector pixels: the inverse of `DistortionCorrection`, by Newton's method.
 
     Every answer has been verified by its residual, or a bound of it (1e-9 px).  NaN where there is
-    none, which includes all points whose answer would lie outside the table's nodes.
+    none.
 
     Parameters
     ----------
@@ -301,6 +308,13 @@ class DetectorToSky(Model):
         super().__init__(**kwargs)
         self.inputs, self.outputs = distortion.inputs, sky.outputs
 
+    def __repr__(self):
+        return self._format_repr(kwargs={"distortion": self.distortion, "sky": self.sky})
+
+    def __str__(self):
+        parts = [("Distortion", repr(self.distortion)), ("Sky", repr(self.sky))]
+        return self._format_str(parts)
+
     def evaluate(self, x, y):
         """Map detector pixels to the sky.
 
@@ -312,7 +326,7 @@ class DetectorToSky(Model):
         Returns
         -------
         ra, dec : ndarray
-            Positions in degrees; NaN outside the table.
+            Positions in degrees.
         """
         return evaluate_blocks(self.block_function(), x, y)
 
@@ -331,19 +345,19 @@ class DetectorToSky(Model):
         function : callable
             ``function(x, y) -> ra, dec``.
         """
-        to_plane, deproject = self.sky._after(self.distortion._plane_map())
-        grid = to_plane.grid
-        if box is not None and grid is not None and np.isnan(fill_value):
-            # What is outside the grid is NaN as it is.
-            edges = (grid.x_range, grid.y_range)
-            if all(e[0] >= b[0] and e[1] <= b[1] for e, b in zip(edges, box, strict=True)):
-                box = None
+        to_sky = self.sky._after(self.distortion._plane_map())
         if box is None:
-            return lambda x, y: deproject(*to_plane(x, y))
+            return to_sky
         (x_low, x_high), (y_low, y_high) = box
+        grid = to_sky.to_plane.grid
+        if grid is not None:
+            edges = (grid.x_range, grid.y_range)
+            if all(e[0] <= b[0] and e[1] >= b[1] for e, b in zip(edges, box, strict=True)):
+                # What is outside the grid is filled anyway.
+                to_sky = to_sky.inside
 
         def function(x, y):
-            ra, dec = deproject(*to_plane(x, y))
+            ra, dec = to_sky(x, y)
             # Written so that NaN counts as outside.
             if len(x) and not (
                 x.min() >= x_low and x.max() <= x_high and y.min() >= y_low and y.max() <= y_high
@@ -368,9 +382,7 @@ class DetectorToSky(Model):
         function : callable
             ``function(y) -> ra, dec`` for M rows, each (M, N).
         """
-        to_plane, deproject = self.sky._after(self.distortion._plane_map())
-        rows = to_plane.along_rows(x)
-        return lambda y: deproject(*rows(y))
+        return self.sky._after(self.distortion._plane_map()).along_rows(x)
 
     @property
     def inverse(self):

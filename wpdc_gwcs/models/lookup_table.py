@@ -55,7 +55,9 @@ class LookupTable(Model):
     Notes
     -----
     Phase 2 of WPDC-2P: ``X'' = X' - dX(x, y)``, ``Y'' = Y' - dY(x, y)``.  The nodes run from the
-    outer edge of the detector to the other, -0.5 ... n - 0.5.  Outside the nodes the model is NaN.
+    outer edge of the detector to the other, -0.5 ... n - 0.5.  Outside the nodes the table goes on
+    in straight lines with the value and the slope of its edge: it is smooth there and means little;
+    what is off the detector is for the bounding box of a WCS to say.
 
     Examples
     --------
@@ -104,6 +106,14 @@ class LookupTable(Model):
         # The spline is worked out again where it is needed.
         return {**self.__dict__, "_cache": None}
 
+    def __repr__(self):
+        (x0, x1), (y0, y1) = (grid[[0, -1]].tolist() for grid in (self._x_grid, self._y_grid))
+        return (
+            f"<{type(self).__name__}({len(self._x_grid)} x {len(self._y_grid)} nodes, "
+            f"x {x0:g} to {x1:g}, y {y0:g} to {y1:g}, {self._method}, "
+            f"up to {np.abs(self.displacement.value).max():.3g} px)>"
+        )
+
     @property
     def x_grid(self):
         """Positions of the nodes along x in pixels (read-only)."""
@@ -148,7 +158,7 @@ class LookupTable(Model):
             low, high = along_y[..., :-1], along_y[..., 1:]
             both = np.stack([low, high - low])  # p, q, k, j, i
             coefficients = np.moveaxis(both, 2, 0)
-            cells = CellGrid(x_grid[[0, -1]], y_grid[[0, -1]], coefficients, smooth=False)
+            cells = CellGrid.continued(x_grid[[0, -1]], y_grid[[0, -1]], coefficients, smooth=False)
         self._cache = (displacement.copy(), cells)
         return cells
 
@@ -165,7 +175,7 @@ class LookupTable(Model):
         Returns
         -------
         dx, dy : ndarray
-            Displacements to subtract, in pixels; NaN outside the nodes.
+            Displacements to subtract, in pixels.
         """
         return evaluate_blocks(PlaneMap(grid=self._cells(displacement)), x, y)
 
@@ -180,7 +190,7 @@ class LookupTable(Model):
         Returns
         -------
         jacobian : (2, 2, ...) ndarray
-            ``jacobian[i, j]`` is the derivative of output i by input j; NaN outside the nodes.
+            ``jacobian[i, j]`` is the derivative of output i by input j.
         """
         plane_map = PlaneMap(grid=self._cells())
         rows = evaluate_blocks(lambda a, b: plane_map.jacobian(a, b)[1], x, y, n_outputs=4)

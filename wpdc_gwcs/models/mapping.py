@@ -28,9 +28,6 @@ _FIT_NODES = 17
 _SPLINE_NODES = 65
 _SPLINE_SIZE = 4096
 
-# How far outside the grid (px) an iterate may go.
-_RIM = 1e-6
-
 
 class PlaneMap:
     """A smooth map of the plane: polynomial, radial terms and cells, summed.
@@ -46,7 +43,7 @@ class PlaneMap:
     radial_matrix : (2, 2) ndarray, optional
         r is the length of ``radial_matrix @ (u, v)``.
     grid : CellGrid, optional
-        Added to the polynomial.  The map is NaN outside it.
+        Added to the polynomial; it has values outside its cells, too.
     """
 
     def __init__(
@@ -101,20 +98,18 @@ class PlaneMap:
         b = m[1, 0] * u + m[1, 1] * v
         return a, b, np.sqrt(a * a + b * b)
 
-    def __call__(self, x, y, margin=0.0):
+    def __call__(self, x, y):
         """Map a block of points.
 
         Parameters
         ----------
         x, y : (N,) ndarray
             Points.
-        margin : float, optional
-            How far outside the grid its outermost cells are still used.
 
         Returns
         -------
         a, b : (N,) ndarray
-            Their images; NaN outside the grid.
+            Their images.
         """
         images = None
         if self.polynomial is not None:
@@ -125,10 +120,7 @@ class PlaneMap:
                 for image, coefficients in zip(images, self.radial, strict=True):
                     image += np.polynomial.polynomial.polyval(r, coefficients)
         if self.grid is not None:
-            cell, s, t, outside = self.grid.locate(x, y, margin)
-            values = self.grid.evaluate(cell, s, t)
-            if outside is not None:
-                values[:, outside] = np.nan
+            values = self.grid.evaluate(*self.grid.locate(x, y))
             if images is not None:
                 values += images
             images = values
@@ -156,18 +148,18 @@ class PlaneMap:
 
             return function
         grid = self.grid
-        low = np.full(1, grid.y_low)
-        x_cell, s, _, x_outside = grid.locate(x, np.broadcast_to(low, x.shape))
+        x_number, s = grid.locate_x(x)
         cache = {}
 
         def function(y):
-            cell, _, t, y_outside = grid.locate(np.full(len(y), grid.x_low), y)
+            y_number, t = grid.locate_y(y)
             a, b = np.empty((2, len(y), len(x)))
-            for first in np.unique(cell):
+            for first in np.unique(y_number):
                 if first not in cache:
                     cache.clear()
-                    cache[first] = grid.collapse(first + x_cell, s)
-                rows = cell == first
+                    cell = grid.number(np.full(len(x), first), x_number)
+                    cache[first] = grid.collapse(cell, s)
+                rows = y_number == first
                 t_rows = t[rows, np.newaxis]
                 for output, (*lower, highest) in zip((a, b), cache[first], strict=True):
                     value = highest * t_rows
@@ -176,24 +168,17 @@ class PlaneMap:
                         value *= t_rows
                     value += lower[0]
                     output[rows] = value
-            for output in (a, b):
-                if x_outside is not None:
-                    output[:, x_outside] = np.nan
-                if y_outside is not None:
-                    output[y_outside] = np.nan
             return a, b
 
         return function
 
-    def jacobian(self, x, y, margin=0.0):
+    def jacobian(self, x, y):
         """Map a block of points and differentiate.
 
         Parameters
         ----------
         x, y : (N,) ndarray
             Points.
-        margin : float, optional
-            How far outside the grid its outermost cells are still used.
 
         Returns
         -------
@@ -222,18 +207,15 @@ class PlaneMap:
                     derivatives[2 * k] += slope * r_x
                     derivatives[2 * k + 1] += slope * r_y
         if self.grid is not None:
-            cell, s, t, outside = self.grid.locate(x, y, margin)
-            grid_values, grid_derivatives = self.grid.evaluate_jacobian(cell, s, t)
+            grid_values, grid_derivatives = self.grid.evaluate_jacobian(*self.grid.locate(x, y))
             for own, other in ((grid_values, values), (grid_derivatives, derivatives)):
-                for k, value in enumerate(own):
-                    if outside is not None:
-                        value[outside] = np.nan
-                    if other is not None:
+                if other is not None:
+                    for k, value in enumerate(own):
                         value += other[k]
             values, derivatives = grid_values, grid_derivatives
         return values, derivatives
 
-    def invert(self, a, b, *, tolerance, margin=_RIM, start=None):
+    def invert(self, a, b, *, tolerance, start=None):
         """Invert a block of points by Newton's method with the analytic Jacobian.
 
         Parameters
@@ -242,9 +224,6 @@ class PlaneMap:
             Images to invert.
         tolerance : float
             Greatest residual of the map at the answer, in units of a and b.
-        margin : float, optional
-            How far outside the grid an answer may lie.  Answers within the default margin, which is
-            there for rounding only, are put on the rim.
         start : (x, y), optional
             Where to start; chosen by default.
 
@@ -255,31 +234,39 @@ class PlaneMap:
 
         Notes
         -----
-        Iterates stay on the grid: for a point that lies on it the way is only shortened by that,
-        and a point that lies outside is left with a residual and becomes NaN.  (They may leave it
-        by 1e-6 px, since rounding moves points of the rim; such an answer is put on the rim.)  A
-        point where the Jacobian determinant has another sign than in the middle (the image is
-        folded over there) is no answer either.
+        Iterates first stay on the grid and one cell around it: for a point that lies there the way
+        is only shortened by that.  What is left with a residual lies farther out, where the map is
+        the polynomial and straight lines: Newton's method goes on for it without bounds.  A point
+        where the Jacobian determinant has another sign than in the middle (the image is folded over
+        there) is no answer.
         """
         good = np.isfinite(a)
         good &= np.isfinite(b)
         with np.errstate(all="ignore"):
             if good.all():
-                x, y = self._solve(a, b, start, tolerance, margin)
-            else:
-                x, y = np.full(a.shape, np.nan), np.full(a.shape, np.nan)
-                start = None if start is None else [value[good] for value in start]
-                x[good], y[good] = self._solve(a[good], b[good], start, tolerance, margin)
-            if margin <= _RIM:
-                self._clip(x, y, 0.0)
+                return self._solve_near_and_far(a, b, start, tolerance)
+            x, y = np.full(a.shape, np.nan), np.full(a.shape, np.nan)
+            start = None if start is None else [value[good] for value in start]
+            x[good], y[good] = self._solve_near_and_far(a[good], b[good], start, tolerance)
         return x, y
 
-    def _solve(self, a, b, start, tolerance, margin):
+    def _solve_near_and_far(self, a, b, start, tolerance):
         if not len(a):
             return np.empty(0), np.empty(0)
         x, y = self._start(a, b) if start is None else (value.copy() for value in start)
-        self._clip(x, y, margin)
-        x_new, y_new, determinant, residual = self._newton_step(a, b, x, y, tolerance, margin)
+        if self.grid is None:
+            return self._solve(a, b, x, y, tolerance, bounded=False)
+        self._clip(x, y)
+        x_out, y_out = self._solve(a, b, x, y, tolerance, bounded=True)
+        far = np.isnan(x_out)
+        if far.any():
+            x_out[far], y_out[far] = self._solve(
+                a[far], b[far], x[far], y[far], tolerance, bounded=False
+            )
+        return x_out, y_out
+
+    def _solve(self, a, b, x, y, tolerance, *, bounded):
+        x_new, y_new, determinant, residual = self._newton_step(a, b, x, y, tolerance, bounded)
         if residual.max() <= tolerance and determinant.min() > 0:
             return x_new, y_new
         # The points that are not done go on by themselves.  Rounding of the map sets the floor.
@@ -299,21 +286,21 @@ class PlaneMap:
                 break
             a, b, limit, index = a[going], b[going], limit[going], index[going]
             x, y = x_new[going], y_new[going]
-            x_new, y_new, determinant, residual = self._newton_step(a, b, x, y, tolerance, margin)
+            x_new, y_new, determinant, residual = self._newton_step(a, b, x, y, tolerance, bounded)
         return x_out, y_out
 
-    def _residual(self, a, b, x, y, margin):
+    def _residual(self, a, b, x, y):
         """Return the greater of both residuals; it needs no derivatives."""
-        fa, fb = self(x, y, margin)
+        fa, fb = self(x, y)
         np.subtract(a, fa, out=fa)
         np.subtract(b, fb, out=fb)
         np.abs(fa, out=fa)
         np.abs(fb, out=fb)
         return np.maximum(fa, fb, out=fa)
 
-    def _newton_step(self, a, b, x, y, tolerance, margin):
+    def _newton_step(self, a, b, x, y, tolerance, bounded):
         """Return the next iterate, its residual, and the determinant here, negative in a fold."""
-        (fa, fb), (a_x, a_y, b_x, b_y) = self.jacobian(x, y, margin)
+        (fa, fb), (a_x, a_y, b_x, b_y) = self.jacobian(x, y)
         np.subtract(a, fa, out=fa)
         np.subtract(b, fb, out=fb)
         determinant = a_x * b_y
@@ -334,23 +321,14 @@ class PlaneMap:
         a_x *= a_x
         residual += a_x
         residual *= 0.5 * self._curvature
-        certain = residual.max() <= tolerance and self._inside(x_new, y_new, margin)
+        certain = residual.max() <= tolerance and self.grid.outside(x_new, y_new) is None
         if not certain:
-            self._clip(x_new, y_new, margin)
-            residual = self._residual(a, b, x_new, y_new, margin)
+            if bounded:
+                self._clip(x_new, y_new)
+            residual = self._residual(a, b, x_new, y_new)
         if self._orientation() < 0:
             np.negative(determinant, out=determinant)
         return x_new, y_new, determinant, residual
-
-    def _inside(self, x, y, margin):
-        x_low, x_high = self.grid.x_range
-        y_low, y_high = self.grid.y_range
-        return (
-            x.min() >= x_low - margin
-            and x.max() <= x_high + margin
-            and y.min() >= y_low - margin
-            and y.max() <= y_high + margin
-        )
 
     def _orientation(self):
         """Return the sign of the Jacobian determinant in the middle, -1 for a mirror."""
@@ -390,20 +368,17 @@ class PlaneMap:
         # Held at the edge: what lies farther out has no answer anyway.
         a, b = a.copy(), b.copy()
         spline.clip(a, b)
-        cell, s, t, _ = spline.locate(a, b)
-        return spline.evaluate(cell, s, t)
+        return spline.evaluate(*spline.locate(a, b))
 
     def _make_start_spline(self):
         """Return a spline of the inverse over the rectangle that the grid is mapped into."""
         a_grid, b_grid = (np.linspace(low, high, _SPLINE_NODES) for low, high in self._start_range)
         a, b = (value.ravel() for value in np.meshgrid(a_grid, b_grid))
         start = self._start_fit(a, b)
-        # The rectangle reaches beyond the grid; its outermost cells are good enough for a start.
-        margin = 2 * max(self.grid.x_step, self.grid.y_step)
-        solved = self.invert(a, b, tolerance=1e-6, margin=margin, start=start)
+        solved = self.invert(a, b, tolerance=1e-6, start=start)
         values = np.where(np.isfinite(solved), solved, start)
         return spline_cells(a_grid, b_grid, values.reshape(2, _SPLINE_NODES, _SPLINE_NODES))
 
-    def _clip(self, x, y, margin):
-        if self.grid is not None:
-            self.grid.clip(x, y, margin)
+    def _clip(self, x, y):
+        """Move points onto the grid and one cell around it, in place."""
+        self.grid.clip(x, y, max(self.grid.x_step, self.grid.y_step))

@@ -6,7 +6,7 @@ import numpy as np
 
 from wpdc_gwcs.models.terms import pv_terms
 
-__all__ = ["derivative", "expand_pv", "fit_polynomial", "horner"]
+__all__ = ["derivative", "expand_pv", "fit_polynomial", "horner", "shift_origin"]
 
 
 def _linear_power(coefficients, power):
@@ -88,6 +88,32 @@ def fit_polynomial(points, values, degree):
     for (p, q), pair in zip(powers, fit, strict=True):
         polynomial[:, p, q] = pair / scale ** (p + q)
     return polynomial, origin
+
+
+def shift_origin(polynomial, origin):
+    """Rewrite polynomials about an origin as polynomials about zero.
+
+    Parameters
+    ----------
+    polynomial : (2, n, n) ndarray
+        ``polynomial[k, p, q]`` multiplies ``(u - origin[0])**p (v - origin[1])**q``.
+    origin : (float, float)
+        The origin.
+
+    Returns
+    -------
+    polynomial : (2, n, n) ndarray
+        The same in powers of u and v.
+    """
+    n = polynomial.shape[1]
+    shifts = [
+        [
+            [math.comb(p, a) * (-centre) ** (p - a) if a <= p else 0.0 for p in range(n)]
+            for a in range(n)
+        ]
+        for centre in origin
+    ]
+    return np.einsum("ap,bq,kpq->kab", *map(np.array, shifts), polynomial)
 
 
 def horner(coefficients, a, b):

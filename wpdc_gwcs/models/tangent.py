@@ -283,10 +283,9 @@ class TangentSky(_Linear):
         return to_sky
 
     def _after(self, plane_map):
-        """Return the whole way to the sky as a map, and a function for what is left to do then.
+        """Return the whole way to the sky, a `_SkyMap`.
 
-        The map leads to the sky itself where that is as good, else to the tangent plane in radians.
-        Both are kept for as long as they are asked for with the same map and the same parameters.
+        It is kept for as long as it is asked for with the same map and the same parameters.
         """
         crpix, cd, crval = self.crpix.value, self.cd.value, self.crval.value
         numbers = np.concatenate([crpix, np.ravel(cd), crval])
@@ -294,14 +293,9 @@ class TangentSky(_Linear):
         if cache is None or cache[0] is not plane_map or not np.array_equal(cache[1], numbers):
             matrix = np.radians(cd)
             to_plane = plane_map.transformed(matrix, -matrix @ crpix)
-            tangent = _Tangent(crval)
-            to_sky = _cells_to_sky(to_plane, tangent, np.sqrt(abs(np.linalg.det(cd))))
-            if to_sky is None:
-                cache = (plane_map, numbers, to_plane, tangent.deproject_radians)
-            else:
-                cache = (plane_map, numbers, to_sky, tangent.wrap)
-            self._cache = cache
-        return cache[2:]
+            to_sky = _SkyMap(to_plane, _Tangent(crval), np.sqrt(abs(np.linalg.det(cd))))
+            cache = self._cache = (plane_map, numbers, to_sky)
+        return cache[2]
 
     def __getstate__(self):
         return {**self.__dict__, "_cache": None}
@@ -315,6 +309,51 @@ class TangentSky(_Linear):
 # Error allowed where cells lead to the sky (px), and the most cells that are made for it.
 _CELL_TOLERANCE_PX = 1e-7
 _MOST_CELLS = 40_000
+
+
+class _SkyMap:
+    """The whole way to the sky on blocks: a map to the tangent plane in radians, then the sphere.
+
+    Where cells lead to the sky itself as well as that, they are used for what lies inside them.
+    """
+
+    def __init__(self, to_plane, tangent, scale):
+        self.to_plane = to_plane
+        self._tangent = tangent
+        self._cells = _cells_to_sky(to_plane, tangent, scale)
+
+    def __call__(self, x, y):
+        ra, dec = self.inside(x, y)
+        if self._cells is not None:
+            outside = self._cells.grid.outside(x, y)
+            if outside is not None:
+                ra[outside], dec[outside] = self._tangent.deproject_radians(
+                    *self.to_plane(x[outside], y[outside])
+                )
+        return ra, dec
+
+    def inside(self, x, y):
+        """Map points of which only those inside the cells matter."""
+        if self._cells is None:
+            return self._tangent.deproject_radians(*self.to_plane(x, y))
+        return self._tangent.wrap(*self._cells(x, y))
+
+    def along_rows(self, x):
+        """Return a function ``function(y) -> ra, dec`` for whole rows of an image."""
+        slow = self.to_plane.along_rows(x)
+        if self._cells is None:
+            return lambda y: self._tangent.deproject_radians(*slow(y))
+        grid = self._cells.grid
+        quick = self._cells.along_rows(x)
+        x_ends = np.array([x.min(), x.max()]) if len(x) else np.empty(0)
+
+        def function(y):
+            y_ends = np.array([y.min(), y.max()]) if len(y) else np.empty(0)
+            if len(x_ends) and len(y_ends) and grid.outside(x_ends, y_ends) is not None:
+                return self._tangent.deproject_radians(*slow(y))
+            return self._tangent.wrap(*quick(y))
+
+        return function
 
 
 def _cells_to_sky(to_plane, tangent, scale):

@@ -1,0 +1,330 @@
+"""The manifest of a run: what went in, how, and how far it has come."""
+
+import dataclasses
+import hashlib
+import json
+import re
+import sys
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from wpdc_gwcs import exceptions
+from wpdc_gwcs.calibration.start import sky_of
+from wpdc_gwcs.exceptions import FileFormatError, FrameFailure, InternalError
+
+__all__ = ["Manifest", "files_of", "frame_sum", "plan_run", "read_manifest"]
+
+_PACKAGES = ("wpdc_gwcs", "numpy", "scipy", "astropy", "gwcs", "asdf", "photutils", "sep")
+# What the same run has the same of.
+_CHOICES = ("software", "settings", "catalog", "solution", "update")
+
+
+@dataclass(frozen=True, eq=False)
+class Manifest:
+    """What a run is, and what has become of its frames.
+
+    Parameters
+    ----------
+    run : str
+        Identity of the run, which all its files carry.
+    created : str
+        When it began, UTC.
+    software, settings, catalog, solution, update : dict, str, bool
+        Versions, options, and sums over the reference catalogue and the stored solutions.
+    inputs : list of dict
+        Path, size and time of each input file.
+    frames : dict
+        Frame name to ``detector``, ``camera``, ``exposure``, ``input`` (sum over what the frame
+        is), ``group`` (number of those that it is solved with), ``state`` (``pending``, ``solved``,
+        ``degraded`` or ``failed``) and, once it is done, ``error`` (class of the failure) and
+        ``files``.
+    """
+
+    run: str
+    created: str
+    software: dict
+    settings: dict
+    catalog: dict
+    solution: str | None
+    update: bool
+    inputs: list
+    frames: dict = field(repr=False)
+
+    def differences(self, other):
+        """Name the choices of another run that are not those of this one.
+
+        Parameters
+        ----------
+        other : Manifest
+            The other run.
+
+        Returns
+        -------
+        list of str
+            Such as ``n_grid 50, now 20``.
+        """
+        found = []
+        for name in _CHOICES:
+            before, now = getattr(self, name), getattr(other, name)
+            if before == now:
+                continue
+            if isinstance(before, dict) and isinstance(now, dict) and name != "catalog":
+                for key in sorted({*before, *now}):
+                    if before.get(key) != now.get(key):
+                        found.append(f"{key} {before.get(key)}, now {now.get(key)}")
+            elif name == "update":
+                found.append(f"update {before}, now {now}")
+            else:
+                found.append(f"another {name}")
+        return found
+
+    def is_same(self, other, names):
+        """Tell whether some frames are solved together in two runs, and are the same frames.
+
+        Parameters
+        ----------
+        other : Manifest
+            The other run.
+        names : set of str
+            Frames that it solves together.
+
+        Returns
+        -------
+        bool
+            False also if it cannot be told, of frames that are no files.
+        """
+        if not names <= set(self.frames):
+            return False
+        numbers = {self.frames[name]["group"] for name in names}
+        together = {n for n, frame in self.frames.items() if frame["group"] in numbers}
+        return together == names and all(
+            self.frames[n]["input"] is not None
+            and self.frames[n]["input"] == other.frames[n]["input"]
+            for n in names
+        )
+
+    def with_states(self, states):
+        """Manifest after some frames are done.
+
+        Parameters
+        ----------
+        states : dict
+            Frame name to what has changed of it.
+
+        Returns
+        -------
+        Manifest
+            The new one.
+        """
+        frames = {n: {**frame, **states.get(n, {})} for n, frame in self.frames.items()}
+        return dataclasses.replace(self, frames=frames)
+
+    def to_json(self):
+        """Text of the manifest.
+
+        Returns
+        -------
+        str
+            JSON, two blanks of indentation.
+        """
+        return json.dumps(dataclasses.asdict(self), indent=2) + "\n"
+
+    def failure_of(self, name, reason):
+        """Error of a frame that failed.
+
+        Parameters
+        ----------
+        name : str
+            Name of the frame.
+        reason : str
+            Message.
+
+        Returns
+        -------
+        WPDCError
+            Of the class that it had.
+        """
+        kind = getattr(exceptions, str(self.frames[name].get("error")), FrameFailure)
+        return kind(reason)
+
+    def is_done(self, name):
+        """Tell whether another try of a frame would give the same.
+
+        Parameters
+        ----------
+        name : str
+            Name of the frame.
+
+        Returns
+        -------
+        bool
+            False for what was not come to, or met an internal error.
+        """
+        frame = self.frames[name]
+        return frame["state"] != "pending" and frame.get("error") != InternalError.__name__
+
+
+def plan_run(run_id, groups, *, settings, catalog, catalog_path, solution, update):
+    """Manifest of a run that begins.
+
+    Parameters
+    ----------
+    run_id : str
+        Its identity.
+    groups : list of list of Frame
+        Frames that are solved together.
+    settings : Settings
+        Choices.
+    catalog : `~astropy.table.Table`
+        Reference catalogue as read.
+    catalog_path : path-like or None
+        Its file, if it came from one.
+    solution : DistortionSolution, mapping or None
+        Stored solutions.
+    update : bool
+        Whether they are updated.
+
+    Returns
+    -------
+    Manifest
+        All frames pending.
+    """
+    files = {file: None for group in groups for frame in group for file in files_of(frame)}
+    if catalog_path is not None:
+        files[Path(re.sub(r"\[[^\[\]]*\]$", "", str(catalog_path)))] = None
+    return Manifest(
+        run=run_id,
+        created=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        software={
+            **{name: version(name) for name in _PACKAGES},
+            "python": ".".join(map(str, sys.version_info[:3])),
+        },
+        # As it is read back.
+        settings=json.loads(json.dumps(dataclasses.asdict(settings), default=repr)),
+        catalog={"rows": len(catalog), "sum": _sum_of_table(catalog)},
+        solution=None if solution is None else _sum_of_solution(solution),
+        update=bool(update),
+        inputs=[_state_of(file) for file in files if file.is_file()],
+        frames={
+            frame.name: {
+                "detector": frame.detector,
+                "camera": frame.camera,
+                "exposure": frame.exposure,
+                "input": frame_sum(frame),
+                "group": number,
+                "state": "pending",
+            }
+            for number, group in enumerate(groups)
+            for frame in group
+        },
+    )
+
+
+def read_manifest(path):
+    """Read a manifest.
+
+    Parameters
+    ----------
+    path : path-like
+        File that holds `Manifest.to_json`.
+
+    Returns
+    -------
+    Manifest
+        As written.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is no manifest.
+    """
+    try:
+        manifest = Manifest(**json.loads(Path(path).read_text(encoding="utf-8")))
+        for frame in manifest.frames.values():
+            if not {"input", "group", "state"} <= set(frame):
+                raise ValueError("a frame lacks its state")
+    except (OSError, TypeError, ValueError, AttributeError, RecursionError) as problem:
+        raise FileFormatError(f"{path}: not a manifest of a run: {problem}") from problem
+    return manifest
+
+
+def frame_sum(frame):
+    """Sum over what a frame is: size and time of its files, and what its header says.
+
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+
+    Returns
+    -------
+    str or None
+        `None` for a frame of no file, of which nothing can be said without reading it.
+    """
+    files = files_of(frame)
+    if not files or not all(file.is_file() for file in files):
+        return None
+    ny, nx = frame.image_shape
+    x, y = np.meshgrid(np.linspace(0, nx - 1, 3), np.linspace(0, ny - 1, 3))
+    plain = {
+        f.name: getattr(frame, f.name)
+        for f in dataclasses.fields(frame)
+        if f.name != "wcs" and not callable(getattr(frame, f.name))
+    }
+    states = [[state["size"], state["modified"]] for state in map(_state_of, files)]
+    text = json.dumps([plain, states], sort_keys=True, default=repr)
+    try:
+        sky = np.array(sky_of(frame.wcs, x.ravel(), y.ravel()))
+    except Exception:  # noqa: BLE001  A WCS that cannot be used is the failure of its frame, later.
+        return None
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass") + sky.tobytes()).hexdigest()
+
+
+def files_of(frame):
+    """Files of a frame: that of its source, which may name an extension, and what goes with it.
+
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+
+    Returns
+    -------
+    list of Path
+        Empty for a frame that came from no file.
+    """
+    if not frame.source:
+        return []
+    path = Path(frame.source)
+    path = path if path.exists() else Path(re.sub(r"\[[^\[\]]*\]$", "", frame.source))
+    return [path, *map(Path, frame.inputs)]
+
+
+def _state_of(file):
+    stat = file.stat()
+    return {
+        "path": str(file).encode("utf-8", "backslashreplace").decode(),
+        "size": stat.st_size,
+        "modified": datetime.fromtimestamp(stat.st_mtime_ns / 1e9, UTC).isoformat(),
+    }
+
+
+def _sum_of_table(table):
+    digest = hashlib.sha256()
+    for name in sorted(table.colnames):
+        values = np.ascontiguousarray(table[name])
+        digest.update(f"{name} {values.dtype.str} {values.shape}".encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()
+
+
+def _sum_of_solution(solution):
+    from wpdc_gwcs.io.asdf import sum_of
+
+    stored = solution if hasattr(solution, "items") else {solution.detector: solution}
+    text = "".join(f"{name} {sum_of(one)}\n" for name, one in sorted(stored.items()))
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()

@@ -1,0 +1,238 @@
+"""The sources of one frame: measured on its pixels, or as its list gives them."""
+
+import logging
+import warnings
+
+import numpy as np
+
+from wpdc_gwcs.calibration.settings import Settings
+from wpdc_gwcs.centroids import build_epsf, fit_centroids, measure_noise, subtract_stars
+from wpdc_gwcs.detection import (
+    detect_companions,
+    detect_sources,
+    mask_hits,
+    saturation_problem,
+    subtract_background,
+)
+from wpdc_gwcs.exceptions import DetectionError, WPDCWarning
+from wpdc_gwcs.selection import judge_sources, left_out
+
+__all__ = ["measure_sources", "quality_of", "rules_of"]
+
+log = logging.getLogger(__name__)
+
+# Images smaller than this, px, have no background, and no stars on it.
+_SMALLEST = 8
+
+# Rounds after which close pairs have shared out their light.
+_PASSES_OF_PAIRS = 6
+
+# Noise of the sky in electrons below which a gain cannot be that of the pixels: no detector reads
+# out so quietly, and the sky's own photons come on top.
+_MIN_ELECTRONS = 0.2
+
+# Factors between a stated gain and the one that the noise in the stars shows.  Scatter below the
+# photons' is proof; more of it may also be a PSF that does not fit, but for a good one.
+_MAX_GAIN_RATIO = 2.5
+_GOOD_MISMATCH = 0.03
+# Stars that prove it.
+_MIN_STARS = 20
+
+# Signal-to-noise ratio in an aperture that holds all the light of a star, over that of the fit:
+# 2 sigma / (1.5 FWHM) for a Gaussian and a radius of 1.5 FWHM, a little more with its photons.  The
+# limit is about the ratio in an aperture; the fit's is the less noisy measure of it, for any PSF.
+_APERTURE_SHARE = 0.61
+
+
+def measure_sources(frame, settings=None):
+    """Source table of a frame: measured on its image, or read from its source list.
+
+    Parameters
+    ----------
+    frame : Frame
+        Image or source list.
+    settings : Settings, optional
+        ``centroids``, ``threshold``, ``min_snr``, ``gain`` and ``saturation`` are used.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        Columns ``x``, ``y`` (px, zero based) and what else was measured.  Of an image, the meta
+        data hold ``fwhm`` (px), ``ellipticity``, ``saturation``, ``noise`` (counts) and, where a
+        PSF was fitted, ``gain`` (electrons per count) and ``mismatch`` (of the PSF, relative).
+
+    Raises
+    ------
+    DetectionError
+        If there are no stars on the image, or no rows in the list.
+
+    Warns
+    -----
+    WPDCWarning
+        If the header's gain or saturation contradicts the pixels: it is left aside.
+
+    Notes
+    -----
+    Fainter stars than ``min_snr`` are measured with the others, whose light they disturb, and left
+    out at the end.
+    """
+    settings = Settings() if settings is None else settings
+    if frame.load_sources is not None:
+        sources = frame.load_sources()
+        if len(sources) == 0:
+            raise DetectionError(f"{frame.source}: the source list has no rows")
+        return sources
+    if settings.centroids == "given":
+        raise DetectionError(
+            f"{frame.source}: centroids 'given' needs a source list, and this is an image"
+        )
+    if min(frame.image_shape) < _SMALLEST:
+        raise DetectionError(
+            f"{frame.source}: the image must be at least {_SMALLEST} x {_SMALLEST} px, is of shape "
+            f"(ny, nx) {frame.image_shape}"
+        )
+    image = frame.load_image()
+    mask = None if frame.load_mask is None else frame.load_mask()
+    weight = None if frame.load_weight is None else frame.load_weight()
+    background = mask_hits(subtract_background(image, mask=mask, weight=weight))
+    gain = _first_gain(frame, settings, background)
+    saturation = _saturation(frame, settings, background)
+    options = {"threshold": settings.threshold, "saturation": saturation}
+    detected = detect_sources(background, gain=gain, **options)
+    sources = detected
+    if settings.centroids == "psf":
+        epsf = build_epsf(background, detected, gain=gain)
+        if epsf is not None:
+            noise = measure_noise(background, detected, epsf)
+            if settings.gain is None and _contradicts(gain, noise):
+                _warn(
+                    frame,
+                    "gain",
+                    gain,
+                    f"the noise in its stars is that of a gain of {noise.gain:.3g}",
+                )
+                gain = noise.gain
+                detected = detect_sources(background, gain=gain, **options)
+                epsf = build_epsf(background, detected, gain=gain)
+            detected, sources = _fit_psf(background, detected, epsf, gain, settings.threshold)
+            sources.meta.update(gain=noise.gain, mismatch=noise.mismatch)
+    sources.meta["noise"] = background.noise
+    if settings.min_snr == 0:
+        return sources
+    snr = np.asarray(sources["snr"], float)
+    bright = (_APERTURE_SHARE if "chi2" in sources.colnames else 1.0) * snr >= settings.min_snr
+    if not bright.any():
+        raise DetectionError(
+            f"{frame.source}: none of {len(sources)} sources has a signal-to-noise ratio above "
+            f"{settings.min_snr:g}"
+        )
+    sources.meta["n_faint"] = int(np.count_nonzero(~bright))
+    return sources[bright]
+
+
+def quality_of(frame, sources, settings):
+    """Tell what a frame is like: its PSF and noise, and how many sources each rule leaves out.
+
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+    sources : `~astropy.table.Table` or None
+        As from `measure_sources`.
+    settings : Settings
+        ``max_roundness`` and ``min_snr`` are used.
+
+    Returns
+    -------
+    dict
+        ``fwhm`` (px), ``ellipticity``, ``mismatch`` (error of the PSF at its peak, relative),
+        ``gain`` (electrons per count, as measured), ``noise`` (counts), each NaN where it has not
+        been measured, and ``left_out``.
+    """
+    meta = {} if sources is None else sources.meta
+    result = {}
+    for name in ("fwhm", "ellipticity", "mismatch", "gain", "noise"):
+        value = meta.get(name)
+        result[name] = float(value) if isinstance(value, int | float) else np.nan
+    result["left_out"] = "" if sources is None else left_out(rules_of(sources, frame, settings))
+    return result
+
+
+def rules_of(sources, frame, settings):
+    """Judge the sources of a frame by the rules of the settings.
+
+    Parameters
+    ----------
+    sources : `~astropy.table.Table`
+        What was measured.
+    frame : Frame
+        Its shape counts.
+    settings : Settings
+        ``max_roundness`` and ``min_snr`` are used.
+
+    Returns
+    -------
+    dict
+        As from `wpdc_gwcs.selection.judge_sources`.
+    """
+    return judge_sources(
+        sources,
+        image_shape=frame.image_shape,
+        max_roundness=settings.max_roundness,
+        min_snr=settings.min_snr,
+    )
+
+
+def _first_gain(frame, settings, background):
+    """Gain that was given, or that of the header unless the noise of the sky rules it out."""
+    if settings.gain is not None or frame.gain is None:
+        return settings.gain
+    electrons = frame.gain * background.noise
+    if electrons > _MIN_ELECTRONS:
+        return frame.gain
+    _warn(frame, "gain", frame.gain, f"the noise of its sky would be {electrons:.2g} electrons")
+    return None
+
+
+def _contradicts(gain, noise):
+    """Tell whether the noise in the stars rules out a stated gain."""
+    if gain is None or noise.n_stars < _MIN_STARS:
+        return False
+    if noise.gain > _MAX_GAIN_RATIO * gain:
+        return True
+    return noise.gain < gain / _MAX_GAIN_RATIO and noise.mismatch < _GOOD_MISMATCH
+
+
+def _saturation(frame, settings, background):
+    """Saturation level that was given, or that of the header unless the pixels rule it out."""
+    if settings.saturation is not None or frame.saturation is None:
+        return settings.saturation
+    problem = saturation_problem(background, frame.saturation)
+    if problem is None:
+        return frame.saturation
+    _warn(frame, "saturation", frame.saturation, problem)
+    return None
+
+
+def _warn(frame, what, value, why):
+    warnings.warn(
+        f"{frame.source}: the header's {what} of {value:g} is not that of the pixels, and is left "
+        f"aside: {why}",
+        WPDCWarning,
+    )
+
+
+def _fit_psf(background, detected, epsf, gain, threshold):
+    """Fit the PSF to all sources and to what shows once they are subtracted.
+
+    Returns the sources as they were detected, companions included, and as they were fitted.
+    """
+    fitted = fit_centroids(background, detected, epsf, gain=gain)
+    residual = subtract_stars(background, fitted, epsf, gain=gain)
+    detected = detect_companions(residual, detected, threshold=threshold, gain=gain)
+    start = detected.copy()
+    for name in ("x", "y", "flux"):
+        start[name][: len(fitted)] = fitted[name]
+    return detected, fit_centroids(
+        background, start, epsf, gain=gain, refit=True, passes=_PASSES_OF_PAIRS
+    )

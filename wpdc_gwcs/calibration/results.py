@@ -1,0 +1,471 @@
+"""The result folder of a run: names that are checked first, and sets of files that are whole."""
+
+import json
+import os
+import shutil
+import stat
+import tempfile
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from astropy.table import Table
+
+from wpdc_gwcs.calibration.manifest import files_of, read_manifest
+from wpdc_gwcs.calibration.staging import FRAME_SUFFIXES, REMOVED, clean, lock, put_in_place
+from wpdc_gwcs.calibration.summary import summarize
+from wpdc_gwcs.exceptions import InputError
+
+__all__ = ["ERRORS", "Outcome", "ResultFolder", "file_stem", "superseded_name"]
+
+#: Where the details of internal errors are.
+ERRORS = "errors.log"
+_SUMMARY, _MANIFEST = "summary.ecsv", "manifest.json"
+
+
+def file_stem(name):
+    """Make a file name of the name of a detector or camera, whatever characters it has.
+
+    Parameters
+    ----------
+    name : str
+        Name of the detector.
+
+    Returns
+    -------
+    str
+        Name without characters that a file system may refuse.
+    """
+    return "".join(c if c.isalnum() or c in "._-" else "_" for c in name)
+
+
+def superseded_name(solution):
+    """Name of the file of a solution that no longer holds.
+
+    Parameters
+    ----------
+    solution : DistortionSolution
+        With the epoch until which it was valid.
+
+    Returns
+    -------
+    str
+        Such as ``ccd1.until-2024.5000.solution.asdf``.
+    """
+    return f"{file_stem(solution.detector)}.until-{solution.valid_to:.4f}.solution.asdf"
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What was found of frames that are solved together.
+
+    Parameters
+    ----------
+    calibrations : list of Calibration
+        Of the solved frames.
+    solutions, superseded : dict
+        Detector to its solution, and to the stored one that no longer holds.
+    failures : dict
+        Frame name to error.
+    cameras : list of Camera
+        Of the detectors that were solved together.
+    rows : list of dict
+        Rows of the summary, one for each frame.
+    """
+
+    calibrations: list = field(default_factory=list)
+    solutions: dict = field(default_factory=dict)
+    superseded: dict = field(default_factory=dict)
+    failures: dict = field(default_factory=dict)
+    cameras: list = field(default_factory=list)
+    rows: list = field(default_factory=list)
+
+
+class ResultFolder:
+    """Files of one run; a context manager, within which no other run writes into the folder.
+
+    Parameters
+    ----------
+    folder : path-like
+        The folder; made if needed.
+    overwrite : bool, optional
+        Whether files may be replaced.
+    resume : bool, optional
+        Whether what a run of the same inputs and choices has done is left as it is.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written to, or another run is writing into it.
+    """
+
+    def __init__(self, folder, *, overwrite=False, resume=False):
+        self.folder = Path(folder)
+        self._overwrite = overwrite
+        self._resume = resume
+        self._manifest = None
+        self._done = set()  # frames that the resumed run has done
+        self._mine = set()  # files that may be replaced
+        self._rows = {}
+        self._names = {}  # first frame of a group to the files that the group may write
+        self._inputs = set()
+        self._lock = None
+
+    def __enter__(self):
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.folder):
+                pass
+        except (OSError, ValueError) as err:
+            reason = getattr(err, "strerror", None) or err
+            raise InputError(
+                f"{self.folder}: the output folder must be writable: {reason}"
+            ) from err
+        self._lock = lock(self.folder)
+        clean(self.folder)
+        return self
+
+    def __exit__(self, *_):
+        clean(self.folder)
+        if self._lock is not None:
+            os.close(self._lock)
+
+    def check(self, groups, *, inputs=()):
+        """Check all names before the work.
+
+        Parameters
+        ----------
+        groups : list of list of Frame
+            Frames that are solved together.
+        inputs : list of Path, optional
+            Files besides those of the frames that are never replaced.
+
+        Raises
+        ------
+        InputError
+            If two things have one file, if a file is there and may not be replaced, or if an input
+            would be replaced.
+        """
+        cameras = Counter()
+        for group in groups:
+            self._names[group[0].name] = _names_of(group, cameras)
+        _check_distinct(self._names.values())
+        frames = [frame for group in groups for frame in group]
+        files = [*inputs, *(file for frame in frames for file in files_of(frame))]
+        self._inputs = {Path(file).resolve() for file in files}
+        if not self._resume:
+            self._check_free(groups)
+
+    def _check_free(self, groups):
+        names = [n for g in groups if not self.is_done(g) for n in self._names[g[0].name]]
+        for name in [*names, _SUMMARY, _MANIFEST]:
+            self._require_free(name)
+
+    def begin(self, groups, plan):
+        """Begin a run, or go on with one.
+
+        Parameters
+        ----------
+        groups : list of list of Frame
+            Frames that are solved together.
+        plan : Manifest
+            The run.
+
+        Returns
+        -------
+        Manifest
+            The run; with the identity of the one that is resumed.
+
+        Raises
+        ------
+        InputError
+            If the run that is to be resumed was of other choices, or if a file of what it has not
+            done may not be replaced.
+        """
+        self._manifest = plan
+        if self._resume:
+            if (self.folder / _MANIFEST).exists():
+                self._continue(read_manifest(self.folder / _MANIFEST), groups)
+            self._check_free(groups)
+        return self._manifest
+
+    def _require_free(self, name):
+        """Refuse to go on if a file of the folder is there and may not be replaced."""
+        path = self.folder / name
+        try:
+            mode = path.stat().st_mode
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError) as err:
+            reason = getattr(err, "strerror", None) or err
+            raise InputError(f"{path}: cannot be written: {reason}") from err
+        if not stat.S_ISREG(mode):
+            what = "a folder" if stat.S_ISDIR(mode) else "no file"
+            raise InputError(f"{path}: is {what}, and a file of this name would be written")
+        if path.resolve() in self._inputs:
+            raise InputError(f"{path}: is an input, and a file of this name would be written")
+        if not (self._overwrite or name in self._mine):
+            raise InputError(f"{path}: file exists, and is replaced only with --overwrite")
+
+    def _continue(self, earlier, groups):
+        """Take over what an earlier run has done, if it was of the same choices."""
+        plan = self._manifest
+        found = earlier.differences(plan)
+        if found and self._overwrite:
+            return
+        if found:
+            raise InputError(
+                f"{self.folder}: a run is resumed with the same choices: {'; '.join(found)}; "
+                "--overwrite begins anew"
+            )
+        summary = self.folder / _SUMMARY
+        rows = _read_rows(summary, earlier.run) if summary.exists() else {}
+        states = {}
+        for group in groups:
+            members = {frame.name for frame in group}
+            if not earlier.is_same(plan, members):
+                continue
+            self._mine |= set(self._names[group[0].name])
+            written = {name for n in members for name in earlier.frames[n].get("files", ())}
+            if all(earlier.is_done(n) and n in rows for n in members) and all(
+                (self.folder / name).is_file() for name in written
+            ):
+                self._done |= members
+                states |= {n: earlier.frames[n] for n in members}
+                self._rows |= {n: rows[n] for n in members}
+        self._mine |= {_SUMMARY, _MANIFEST}
+        plan = replace(plan, run=earlier.run, created=earlier.created)
+        self._manifest = plan.with_states(
+            {
+                n: {key: state[key] for key in ("state", "error", "files")}
+                for n, state in states.items()
+            }
+        )
+
+    def is_done(self, group):
+        """Tell whether frames were done by the run that is resumed, and are left out.
+
+        Parameters
+        ----------
+        group : list of Frame
+            Frames that are solved together.
+
+        Returns
+        -------
+        bool
+            If so, `load` gives what was found.
+        """
+        return group[0].name in self._done
+
+    def load(self, group):
+        """Read what is done already.
+
+        Parameters
+        ----------
+        group : list of Frame
+            Frames for which `is_done` is true.
+
+        Returns
+        -------
+        Outcome
+            As it was written.
+
+        Raises
+        ------
+        InputError
+            If a file is damaged, or of another run.
+        """
+        from wpdc_gwcs.io import read, read_table
+
+        run, states = self._manifest.run, self._manifest.frames
+        outcome = Outcome(rows=[self._rows[frame.name] for frame in group])
+        for row in outcome.rows:
+            if row["status"] == "failed":
+                error = self._manifest.failure_of(row["frame"], row["reason"])
+                outcome.failures[row["frame"]] = error
+        for name in dict.fromkeys(n for frame in group for n in states[frame.name]["files"]):
+            path = self.folder / name
+            if name.endswith(".wcs.asdf"):
+                stem = name.removesuffix(".wcs.asdf")
+                found = read(path)
+                tables = {
+                    kind: read_table(self.folder / f"{stem}.{kind}.ecsv")
+                    for kind in ("sources", "matches")
+                    if f"{stem}.{kind}.ecsv" in states[stem]["files"]
+                }
+                runs = [found.provenance.get("run"), *(t.meta.get("run") for t in tables.values())]
+                if any(one != run for one in runs):
+                    raise InputError(f"{path}: must be of the run {run} with its tables, is not")
+                outcome.calibrations.append(replace(found, **tables))
+            elif name.endswith(".solution.asdf"):
+                found = read(path)
+                current = name == f"{file_stem(found.detector)}.solution.asdf"
+                kind = outcome.solutions if current else outcome.superseded
+                kind[found.detector] = found
+            elif name.endswith(".camera.asdf"):
+                outcome.cameras.append(read(path))
+        return outcome
+
+    def write(self, group, outcome):
+        """Write what was found of some frames: all of it, or nothing.
+
+        Parameters
+        ----------
+        group : list of Frame
+            The frames.
+        outcome : Outcome
+            What was found.
+
+        Raises
+        ------
+        InputError
+            If a file cannot be written, or has appeared in the meantime.
+        """
+        part = self.folder / f".{self._manifest.run}.part"
+        try:
+            # What an earlier group has left of it when it could not be written.
+            shutil.rmtree(part, ignore_errors=True)
+            part.mkdir()
+            files, shared = self._write_into(part, group, outcome)
+            states = {
+                row["frame"]: {
+                    "state": row["status"],
+                    "error": type(outcome.failures[row["frame"]]).__name__
+                    if row["frame"] in outcome.failures
+                    else None,
+                    "files": [*files[row["frame"]], *shared],
+                }
+                for row in outcome.rows
+            }
+            rows = self._rows | {row["frame"]: row for row in outcome.rows}
+            manifest = self._manifest.with_states(states)
+            self._write_state(part, manifest, rows)
+            for path in part.iterdir():
+                if path.name != REMOVED:
+                    self._require_free(path.name)
+            part.rename(part.with_suffix(".done"))
+        except OSError as err:
+            raise InputError(f"{self.folder}: cannot be written to: {err.strerror or err}") from err
+        self._manifest, self._rows = manifest, rows
+        self._mine |= {path.name for path in part.with_suffix(".done").iterdir()}
+        put_in_place(part.with_suffix(".done"), self.folder)
+
+    def _write_into(self, part, group, outcome):
+        """Write results into a folder: the files of each frame, and those that they share."""
+        from wpdc_gwcs.io import write, write_table
+
+        run = self._manifest.run
+        files = {frame.name: [] for frame in group}
+        for calibration in outcome.calibrations:
+            for kind in ("sources", "matches"):
+                table = getattr(calibration, kind)
+                if table is not None:
+                    name = f"{calibration.frame}.{kind}.ecsv"
+                    write_table(_of_run(table, run), part / name)
+                    files[calibration.frame].append(name)
+            write(_of_run(calibration, run), part / f"{calibration.frame}.wcs.asdf")
+            files[calibration.frame].append(f"{calibration.frame}.wcs.asdf")
+        shared = {f"{file_stem(s.detector)}.solution.asdf": s for s in outcome.solutions.values()}
+        shared |= {superseded_name(s): s for s in outcome.superseded.values()}
+        camera_name = next(
+            (name for name in self._names[group[0].name] if name.endswith(".camera.asdf")), None
+        )
+        for k, camera in enumerate(outcome.cameras):
+            of = {d: f"{file_stem(d)}.solution.asdf" for d in camera.detectors}
+            name = camera_name if k == 0 else f"{file_stem(group[0].name)}-{k + 1}.camera.asdf"
+            shared[name] = replace(camera, files=of)
+        for name, one in shared.items():
+            write(_of_run(one, run), part / name)
+        # What an earlier run left for a frame that now fails, or has no sources of its own, would
+        # pass for its own.
+        removed = [
+            frame.name + suffix
+            for frame in group
+            for suffix in FRAME_SUFFIXES
+            if frame.name + suffix not in files[frame.name]
+        ]
+        (part / REMOVED).write_text(json.dumps(removed), encoding="utf-8")
+        return files, list(shared)
+
+    def _write_state(self, part, manifest, rows):
+        from wpdc_gwcs.io import write_table
+
+        done = [rows[name] for name in manifest.frames if name in rows]
+        write_table(summarize(done, manifest.run), part / _SUMMARY)
+        (part / _MANIFEST).write_text(manifest.to_json(), encoding="utf-8")
+
+    def log(self, name, error):
+        """Keep the details of an internal error.
+
+        Parameters
+        ----------
+        name : str
+            Frame.
+        error : InternalError
+            Where it happened.
+
+        Returns
+        -------
+        Path
+            The file that they are in, after what is there already.
+        """
+        path = self.folder / ERRORS
+        with path.open("a", encoding="utf-8", errors="backslashreplace") as file:
+            file.write(f"{self._manifest.run} {name}: {error}\n{error.details}\n")
+        return path
+
+
+def _names_of(group, cameras):
+    """Files that a group of frames may write, and what each is of."""
+    names = {
+        frame.name + suffix: frame.source or frame.name
+        for frame in group
+        for suffix in reversed(FRAME_SUFFIXES)
+    }
+    detectors = {frame.detector for frame in group}
+    for detector in detectors:
+        names[f"{file_stem(detector)}.solution.asdf"] = f"detector {detector!r}"
+    if len(names) < len(FRAME_SUFFIXES) * len(group) + len(detectors):
+        raise InputError(
+            f"detectors must have different names in files, got {', '.join(sorted(detectors))}"
+        )
+    if len(detectors) > 1:
+        camera = next((frame.camera for frame in group if frame.camera), "camera")
+        cameras[camera] += 1
+        # Exposures that have no detector in common are solved apart.
+        mark = f"-{cameras[camera]}" if cameras[camera] > 1 else ""
+        names[f"{file_stem(camera)}{mark}.camera.asdf"] = f"camera {camera!r}{mark}"
+    return names
+
+
+def _check_distinct(names):
+    owners = {}
+    for files in names:
+        for name, owner in files.items():
+            # Detectors of one name have one stored solution.
+            if name in owners and owners[name] != owner:
+                raise InputError(
+                    f"{owners[name]} and {owner} would both write {name}: calibrate them into "
+                    "different folders"
+                )
+            owners[name] = owner
+
+
+def _of_run(result, run):
+    """Give a result or table the identity of its run."""
+    if isinstance(result, Table):
+        marked = result.copy(copy_data=False)
+        marked.meta["run"] = run
+        return marked
+    return replace(result, provenance={**result.provenance, "run": run})
+
+
+def _read_rows(path, run):
+    """Rows of the summary of a run, by frame; none if it is of another run."""
+    from wpdc_gwcs.io import read_table
+
+    table = read_table(path)
+    if table.meta.get("run") != run:
+        return {}
+    rows = [dict(zip(table.colnames, row.as_void().tolist(), strict=True)) for row in table]
+    return {row["frame"]: row for row in rows}

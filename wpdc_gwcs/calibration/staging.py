@@ -1,0 +1,113 @@
+"""Sets of files that get their names together, or not at all.
+
+::
+
+    group of frames --write--> .RUN.part/ --rename--> .RUN.done/ --move--> the folder
+
+A set is written into a hidden folder, which gets another name when it is complete: until then
+nothing has happened to what is there, from then on all of it will, even if the program is killed,
+since the next run goes on where it stopped.
+"""
+
+import json
+import os
+import re
+import shutil
+
+from wpdc_gwcs.exceptions import InputError
+
+try:
+    import fcntl
+except ImportError:  # a system without locks of this kind
+    fcntl = None
+
+__all__ = ["FRAME_SUFFIXES", "REMOVED", "clean", "lock", "put_in_place"]
+
+#: Files of a frame, in the order in which they get their names.
+FRAME_SUFFIXES = (".sources.ecsv", ".matches.ecsv", ".wcs.asdf")
+#: File of a set that names those that are to go.
+REMOVED = "removed.json"
+# Hidden folders of our own, not those of others.
+_STAGED = re.compile(r"\.[0-9a-f]{12}\.(part|done)")
+
+
+def lock(folder):
+    """Keep other runs out of a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+
+    Returns
+    -------
+    int or None
+        File descriptor whose end is that of the lock, whatever ends the program; `None` where the
+        file system has no locks.
+
+    Raises
+    ------
+    InputError
+        If another run is in it.
+    """
+    if fcntl is None:
+        return None
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise InputError(
+            f"{folder}: another run is writing into this folder: wait, or choose another one"
+        ) from None
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def clean(folder):
+    """Complete the sets that have begun to get their names, and remove those that have not.
+
+    Parameters
+    ----------
+    folder : Path
+        A folder that is locked.
+    """
+    for path in sorted(folder.iterdir()):
+        if not (_STAGED.fullmatch(path.name) and path.is_dir()):
+            continue
+        if path.suffix == ".done":
+            put_in_place(path, folder)
+        else:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def put_in_place(done, folder):
+    """Give the files of a set their names, the WCS of a frame after its tables.
+
+    Parameters
+    ----------
+    done : Path
+        Folder with the whole set, or what is left of it; it is removed.
+    folder : Path
+        Where they go.
+    """
+    try:
+        removed = json.loads((done / REMOVED).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        removed = []
+    for name in removed:
+        (folder / name).unlink(missing_ok=True)
+    # By frame, so that its files come as one as nearly as can be.
+    for name in sorted(os.listdir(done), key=_order):
+        if name != REMOVED:
+            os.replace(done / name, folder / name)
+    shutil.rmtree(done)
+
+
+def _order(name):
+    for k, suffix in enumerate(FRAME_SUFFIXES):
+        if name.endswith(suffix):
+            return 0, name.removesuffix(suffix), k
+    return (2 if name in ("summary.ecsv", "manifest.json") else 1), name, 0

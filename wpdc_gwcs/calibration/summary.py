@@ -1,0 +1,84 @@
+"""The summary of a run: one row per frame, whatever became of it."""
+
+import numpy as np
+from astropy.table import QTable
+
+from wpdc_gwcs.calibration.measure import quality_of
+
+__all__ = ["summarize", "summary_row"]
+
+_UNITS = {"rms_mas": "mas", "seconds": "s", "fwhm": "pix"}
+
+
+def summary_row(frame, result, calibration, failure, settings):
+    """Tell what became of a frame.
+
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+    result : MatchedFrame or FailedFrame
+        Its match.
+    calibration : Calibration or None
+        What was found.
+    failure : WPDCError or None
+        Or why nothing was.
+    settings : Settings
+        What sources were judged by.
+
+    Returns
+    -------
+    dict
+        Column to value.
+    """
+    statistics = {} if calibration is None else calibration.statistics
+    row = {
+        "frame": frame.name,
+        "detector": frame.detector,
+        "camera": frame.camera or "",
+        "exposure": frame.exposure or "",
+        "status": "failed" if calibration is None else statistics["status"],
+        "reason": " ".join(str(failure).split())
+        if calibration is None
+        else "; ".join(statistics["reasons"]),
+        "n_sources": result.n_sources,
+        "n_matched": statistics.get("n_matched", 0),
+    }
+    # A frame may be matched with good evidence and fail afterwards.
+    evidence = getattr(result, "diagnostics", None)
+    for name in ("n_pairs", "n_ambiguous"):
+        row[name] = getattr(evidence, name, 0)
+    for name in ("expected_by_chance", "purity", "completeness", "significance"):
+        row[name] = getattr(evidence, name, np.nan)
+    inside, outside = (statistics.get(key, {}) for key in ("residuals", "holdout"))
+    for name in ("mean_dx", "sigma_dx", "mean_dy", "sigma_dy"):
+        row[name] = inside.get(name, np.nan)
+    for name in ("sigma_dx", "sigma_dy"):
+        row[f"holdout_{name}"] = outside.get(name, np.nan)
+    row["rms_mas"] = statistics.get("rms_mas", np.nan)
+    row["seconds"] = statistics.get("seconds", result.seconds)
+    return row | quality_of(frame, result.sources, settings)
+
+
+def summarize(rows, run_id):
+    """Make a table of rows.
+
+    Parameters
+    ----------
+    rows : list of dict
+        What `summary_row` returned; at least one.
+    run_id : str
+        Identity of the run, for the metadata.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        With units.
+    """
+    table = QTable(rows, meta={"run": run_id})
+    for name in table.colnames:
+        if "_d" in name:
+            table[name].unit = "pix"
+        elif name in _UNITS:
+            table[name].unit = _UNITS[name]
+    return table

@@ -1,0 +1,197 @@
+"""The WCS to other programs and from them: `export`, `convert`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.files import CalibrationFile, read_one
+from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free
+from wpdc_gwcs.exceptions import InputError
+
+FORMATS = ("fits", "cpdis", "tpv", "head", "sip", "tab", "stock")
+
+Degree = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        help="Degree of the polynomials: 1 to 7, for sip 2 to 9. Default: that of the solution for "
+        "fits and cpdis, for the others the lowest that is good to 0.001 px, or nearly as good as "
+        "any.",
+    ),
+]
+
+
+@app.command("export", no_args_is_help=True)
+def export_command(
+    file: CalibrationFile,
+    format: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            metavar="{fits,cpdis,tpv,head,sip,tab,stock}",
+            help="fits: TPV + table, exact for wpdc; cpdis: for astropy.wcs; tpv, head: TPV of all "
+            "of it, for SWarp, SCAMP, GalSim (as FITS, as text); sip: for DS9; tab: for wcslib; "
+            "stock: gwcs alone. Default with --into: tpv.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", metavar="OUT", help="File to write; with --into, a copy."),
+    ] = None,
+    into: Annotated[
+        str | None,
+        typer.Option(
+            metavar="IMAGE[EXT]",
+            help="Write the WCS into this image in place of the one that it has.",
+        ),
+    ] = None,
+    degree: Degree = None,
+    alternates: Annotated[
+        str,
+        typer.Option(metavar="{keep,remove}", help="With --into: what becomes of alternate WCSs."),
+    ] = "keep",
+    overwrite: Overwrite = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+):
+    """Write a calibrated WCS in a format that other programs read; say how far it deviates."""
+    if format is None and into is not None:
+        format = "tpv"
+    if format not in FORMATS:
+        raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
+    if into is None and output is None:
+        raise InputError("export needs --output FILE, or --into IMAGE")
+    if alternates not in ("keep", "remove"):
+        raise InputError(f"--alternates must be keep or remove, got {alternates!r}")
+    if output is not None:
+        require_free(output, overwrite)
+    calibration = read_one(file)
+    try:
+        if into is not None:
+            where, note = _into(calibration, into, format, degree, output, alternates, overwrite)
+        else:
+            where = output
+            note = write_as(calibration, output, format, degree=degree, overwrite=overwrite)
+    except ValueError as err:
+        raise InputError(str(err)) from err
+    if not quiet:
+        typer.echo(f"{where}: written as {format}{note}")
+
+
+def _into(calibration, image, format, degree, output, alternates, overwrite):
+    from wpdc_gwcs.io.embed import INTO_FORMS, write_into
+
+    if format not in INTO_FORMS:
+        raise InputError(
+            f"--format must be one of {', '.join(INTO_FORMS)} with --into, got {format!r}"
+        )
+    made = write_into(
+        calibration,
+        image,
+        form=format,
+        degree=degree,
+        output=output,
+        alternates=alternates,
+        overwrite=overwrite,
+    )
+    return image if output is None else output, _note(made)
+
+
+def write_as(calibration, output, format, *, degree=None, overwrite=False):
+    """Write a calibration in a format and say in words how good it is.
+
+    Parameters
+    ----------
+    calibration : Calibration or DistortionSolution
+        What to write.
+    output : Path
+        File to write.
+    format : str
+        One of the formats of `wpdc_gwcs.io.write`.
+    degree : int, optional
+        Degree of the polynomials.
+    overwrite : bool, optional
+        Whether an existing file may be replaced.
+
+    Returns
+    -------
+    note : str
+        To be printed behind the name of the format.
+    """
+    from wpdc_gwcs.export import FORMS
+    from wpdc_gwcs.io import write
+    from wpdc_gwcs.io.fits import write_form
+
+    if format in FORMS:
+        return _note(
+            write_form(calibration, output, form=format, degree=degree, overwrite=overwrite)
+        )
+    worst = write(calibration, output, format=format, degree=degree, overwrite=overwrite)
+    return _greatest(worst)
+
+
+def _greatest(worst):
+    return "" if worst is None else f" (greatest deviation {worst:.2g} px)"
+
+
+def _note(made):
+    if made.form != "fits":
+        return _greatest(made.deviation)
+    exact = "exact" if made.deviation is None else f"greatest deviation {made.deviation:.2g} px"
+    if made.keywords_deviation is None:
+        return f" ({exact} for wpdc_gwcs)"
+    return (
+        f" ({exact} for wpdc_gwcs, {made.keywords_deviation:.2g} px for readers of its keywords "
+        "without the table)"
+    )
+
+
+@app.command("convert", no_args_is_help=True)
+def convert_command(
+    file: Annotated[
+        str,
+        typer.Argument(
+            metavar="FILE",
+            help="ASDF with a gwcs, FITS or FITS[EXT] with any WCS, .head or text header.",
+        ),
+    ],
+    to: Annotated[
+        str,
+        typer.Option(
+            metavar="{asdf,fits,cpdis,tpv,head,sip,tab,stock}",
+            help="asdf: as wpdc calibrate writes it; the others: as for wpdc export.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", metavar="OUT", help="File to write.")],
+    size: Annotated[
+        tuple[int, int] | None,
+        typer.Option(metavar="NX NY", help="Size of the image, where the file does not tell."),
+    ] = None,
+    degree: Degree = None,
+    overwrite: Overwrite = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
+):
+    """Convert the WCS of any file to the models of wpdc, in any format; say how far it deviates."""
+    from wpdc_gwcs.camera import Camera
+    from wpdc_gwcs.io.any_wcs import read_any
+
+    formats = ("asdf", *FORMATS)
+    if to not in formats:
+        raise InputError(f"--to must be one of {', '.join(formats)}, got {to!r}")
+    if size is not None and min(size) < 2:
+        raise InputError(f"--size must be two numbers of 2 or more, got {size[0]} {size[1]}")
+    require_free(output, overwrite)
+    found = read_any(file, image_shape=None if size is None else size[::-1])
+    if isinstance(found, Camera):
+        raise InputError(f"{file}: is a camera of {len(found.detectors)} detectors")
+    try:
+        note = write_as(found, output, to, degree=degree, overwrite=overwrite)
+    except ValueError as err:
+        raise InputError(str(err)) from err
+    if not quiet:
+        worst = found.statistics.get("conversion_deviation")
+        read = "read exactly" if worst is None else f"read to {worst:.2g} px"
+        typer.echo(f"{output}: {read}, written as {to}{note}")

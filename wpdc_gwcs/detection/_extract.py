@@ -1,0 +1,156 @@
+"""Peaks of an image, and the size of its stars."""
+
+import numpy as np
+import sep
+
+from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, cutouts, mode, sizes, window
+
+__all__ = ["extract_peaks", "is_broad", "star_size", "typical_fwhm"]
+
+# Smoothing before the threshold: close to a matched filter for FWHM 1.5 to 3 px, and narrow enough
+# not to merge neighbours.
+_KERNEL = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]) / 16
+
+# Stars broader than this, FWHM in px, would fall to pieces under that kernel: the noise makes peaks
+# of their own on rings and trails.
+_BROAD = 4.5
+
+# Rows searched at a time, and their overlap: every source is taken whole, from the strip that holds
+# its peak.
+_STRIP = 512
+_OVERLAP = 64
+
+# Sources that tell the size of the stars.
+_N_BRIGHT = 500
+
+
+def extract_peaks(background, threshold, deblend_contrast, fwhm=0.0):
+    """Extract peaks with sep.
+
+    Parameters
+    ----------
+    background : Background
+        Image without background.
+    threshold : float
+        Least significance of a peak.
+    deblend_contrast : float
+        Least share of the flux of a peak within a larger source.
+    fwhm : float, optional
+        Of the stars, px; broad ones are looked for with a filter as broad.
+
+    Returns
+    -------
+    structured array
+        As from `sep.extract`.
+    """
+    image, rms, mask = background.image, background.rms, background.mask
+    # sep's defaults are for small images: it gives up where more pixels or branches are active.
+    sep.set_sub_object_limit(8192)
+    kernel = _kernel(fwhm)
+    threshold = threshold * np.sqrt((kernel**2).sum())
+    parts = []
+    # In strips, because sep compares every source with every other one.
+    for first in range(0, image.shape[0], _STRIP):
+        last = min(first + _STRIP, image.shape[0])
+        start, stop = max(first - _OVERLAP, 0), min(last + _OVERLAP, image.shape[0])
+        # Room for all pixels of all sources; no more, because sep writes to all of it every time.
+        active = np.count_nonzero(image[start:stop] > threshold * rms[start:stop])
+        sep.set_extract_pixstack(
+            min(300_000 + 3 * active, 300_000 + (stop - start) * image.shape[1])
+        )
+        part = sep.extract(
+            image[start:stop],
+            threshold,
+            err=rms[start:stop],
+            mask=None if mask is None else mask[start:stop],
+            minarea=3,
+            filter_kernel=kernel,
+            filter_type="conv",
+            deblend_cont=deblend_contrast,
+        )
+        for name in ("y", "ypeak", "ycpeak"):
+            part[name] += start
+        parts.append(part[(part["ycpeak"] >= first) & (part["ycpeak"] < last)])
+    return np.concatenate(parts)
+
+
+def is_broad(fwhm):
+    """Tell whether stars of this FWHM in px need a broader filter.
+
+    Parameters
+    ----------
+    fwhm : float
+        Of the stars, px.
+
+    Returns
+    -------
+    bool
+        True from 4.5 px on.
+    """
+    return fwhm > _BROAD
+
+
+def _kernel(fwhm):
+    """Filter of unit sum for stars of this FWHM."""
+    if not is_broad(fwhm):
+        return _KERNEL
+    sigma = fwhm * SIGMA_PER_FWHM
+    step = np.arange(-int(2 * sigma), int(2 * sigma) + 1)
+    line = np.exp(-0.5 * (step / sigma) ** 2)
+    return np.outer(line, line) / line.sum() ** 2
+
+
+def typical_fwhm(background, found):
+    """Find the FWHM of the stars in px: that of the brightest sources that are not saturated.
+
+    Parameters
+    ----------
+    background : Background
+        Image without background.
+    found : structured array
+        Peaks as from `extract_peaks`.
+
+    Returns
+    -------
+    float
+        FWHM.
+    """
+    good = (found["npix"] >= 5) & (found["peak"] < 0.7 * found["peak"].max())
+    rows = np.flatnonzero(good if good.sum() >= 5 else np.ones(len(found), bool))
+    rows = rows[np.argsort(found["cpeak"][rows])[::-1][:_N_BRIGHT]]
+    size = star_size(background.image, found["x"][rows], found["y"][rows])
+    if size is None:
+        # All noise, or broader than any window: stay with the isophotal size.
+        size = [2.35 * float(np.median(np.sqrt(found["a"][rows] * found["b"][rows])))]
+    return float(np.clip(size[0], 1.0, 0.1 * min(background.image.shape)))
+
+
+def star_size(image, x, y):
+    """Find the most frequent size of sources.
+
+    Parameters
+    ----------
+    image : (ny, nx) ndarray
+        Image without background.
+    x, y : (N,) ndarray
+        Positions.
+
+    Returns
+    -------
+    (float, float) or None
+        FWHM in px as a circle and along the minor axis, None where no source tells.
+    """
+    xc, yc = np.rint(x).astype(int), np.rint(y).astype(int)
+    fwhm = sharpest = 2.0
+    for _ in range(4):
+        sigma = fwhm * SIGMA_PER_FWHM
+        half = int(np.ceil(3 * sigma)) + 1
+        pixels = cutouts(image, xc, yc, half)
+        major, minor = sizes(pixels, *window(x, y, xc, yc, half, sigma), sigma)
+        size = np.hypot(major, minor) / np.sqrt(2)
+        known = np.isfinite(size) & (size > 0)
+        if not known.any():
+            return None
+        fwhm = float(np.clip(mode(size[known])[0] / SIGMA_PER_FWHM, 0.75 * fwhm, 2 * fwhm))
+        sharpest = mode(minor[known])[0] / SIGMA_PER_FWHM
+    return fwhm, sharpest

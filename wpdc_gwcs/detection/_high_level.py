@@ -1,0 +1,294 @@
+"""Public functions of the detection: arguments checked, tables out."""
+
+import logging
+
+import numpy as np
+import sep
+from astropy.table import Table, vstack
+from scipy.spatial import KDTree
+
+from wpdc_gwcs.detection._background import Background, subtract_background
+from wpdc_gwcs.detection._extract import extract_peaks, is_broad, typical_fwhm
+from wpdc_gwcs.detection._hits import mask_hits
+from wpdc_gwcs.detection._saturation import plateau
+from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, measure_shapes, mode
+from wpdc_gwcs.exceptions import DetectionError
+from wpdc_gwcs.flags import (
+    FLAG_BLENDED,
+    FLAG_COSMIC,
+    FLAG_EXTENDED,
+    FLAG_SATURATED,
+)
+
+__all__ = ["detect_companions", "detect_sources"]
+
+log = logging.getLogger(__name__)
+
+# A neighbour's light at the centre of a source, relative to the source's own, from which the fit
+# of both together is no longer as good as that of a single star.
+_MAX_SHARE = 0.15
+
+# Nearest that two sources are told apart, in FWHM.
+_RESOLVED = 0.6
+
+# Sources that tell what stars look like, by signal-to-noise ratio.
+_STAR_SNR = 30.0
+
+# Sources measured at a time: bounds the memory for their cut-outs to some tens of MB.
+_CHUNK = 20_000
+
+
+def detect_sources(
+    data,
+    *,
+    threshold=5.0,
+    mask=None,
+    gain=None,
+    saturation=None,
+    deblend_contrast=0.002,
+):
+    r"""Find the sources of an image and measure what tells a clean star from the rest.
+
+    Parameters
+    ----------
+    data : Background or (ny, nx) array_like
+        Image, already without its background, or with; hits are then masked too.
+    threshold : float, optional
+        Least significance of a source's peak, in standard deviations of the smoothed noise.
+    mask : (ny, nx) array_like of bool, optional
+        True where a pixel must not be used; only for a plain image.
+    gain : float, optional
+        Electrons per count, for the photon noise in the errors; without it only the background's
+        noise counts.
+    saturation : float, optional
+        Counts, background included, from which a pixel is saturated.  If not given, it is the
+        plateau of the brightest pixels, if they have one.
+    deblend_contrast : float, optional
+        Least share of the flux that makes a peak within a larger source a source of its own.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        One row per source, in the order found: ``x``, ``y`` (windowed centroid, px, zero based),
+        ``x_err``, ``y_err`` (px), ``flux``, ``flux_err`` (counts), ``snr``, ``peak`` (counts above
+        background), ``fwhm`` (px), ``roundness``, ``sharpness``, ``flags``.  The meta data holds
+        ``fwhm`` and ``ellipticity``, those of a typical star, and ``saturation``.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+    DetectionError
+        If there are no sources, or nothing to find them on.
+
+    Notes
+    -----
+    Sources are extracted by `sep` (Bertin & Arnouts 1996, A&AS 117, 393) after smoothing with a
+    3 x 3 kernel; positions are its windowed centroids with a Gaussian window of the stars' FWHM.
+    With window :math:`w`, pixels :math:`I_i` of noise :math:`\sigma_i`, the error is
+
+    .. math::
+        \sigma_x^2 = 4 \sum w_i^2 \sigma_i^2 (x_i - x)^2 / \left(\sum w_i I_i\right)^2 .
+
+    ``fwhm`` comes from the second moments under the same window, with the window taken out.
+    ``roundness`` is DAOFIND's GROUND, :math:`2 (h_x - h_y) / (h_x + h_y)`, with the heights of
+    Gaussians fitted to the marginal distributions (Stetson 1987, PASP 99, 191), and ``sharpness``
+    is DAOFIND's, both as in `photutils.detection.DAOStarFinder`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import detect_sources
+    >>> y, x = np.mgrid[:200, :200]
+    >>> image = 2000 * np.exp(-((x - 80.3) ** 2 + (y - 120.6) ** 2) / 4)
+    >>> image += np.random.default_rng(1).normal(100, 5, image.shape)
+    >>> sources = detect_sources(image)
+    >>> float(sources["x"][0].round(1)), float(sources["y"][0].round(1)), int(sources["flags"][0])
+    (80.3, 120.6, 0)
+    """
+    for name, value in (("threshold", threshold), ("gain", gain), ("saturation", saturation)):
+        if value is not None and not value > 0:
+            raise ValueError(f"{name} must be positive, got {value}")
+    if not isinstance(data, Background):
+        data = mask_hits(subtract_background(data, mask=mask))
+    elif mask is not None:
+        raise ValueError("mask must be given to subtract_background when data is a Background")
+    found = extract_peaks(data, threshold, deblend_contrast)
+    if len(found) == 0:
+        raise DetectionError(f"no source above {threshold:g} sigma on the image")
+    if saturation is None:
+        saturation = plateau(data)
+    fwhm = typical_fwhm(data, found)
+    if is_broad(fwhm):
+        found = extract_peaks(data, threshold, deblend_contrast, fwhm)
+    table = _measure(data, found, fwhm, gain, saturation)
+    table.meta.update(fwhm=fwhm, saturation=saturation)
+    log.info(
+        "%d sources, %d of them clean, FWHM %.2f px",
+        len(table),
+        np.count_nonzero(table["flags"] == 0),
+        fwhm,
+    )
+    return table
+
+
+def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_contrast=0.002):
+    """Add the sources that show once the known ones are subtracted.
+
+    Parameters
+    ----------
+    residual : Background
+        Image without the known sources, and the noise with their models' error, as from
+        `wpdc_gwcs.centroids.subtract_stars`.
+    sources : `~astropy.table.Table`
+        The known sources, from `detect_sources`.
+    threshold : float, optional
+        Least significance of a source's peak, in standard deviations of the smoothed noise.
+    gain : float, optional
+        Electrons per count.
+    deblend_contrast : float, optional
+        Least share of the flux that makes a peak within a larger source a source of its own.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        The known sources, then the new ones; `FLAG_BLENDED` is set anew for all.
+
+    Notes
+    -----
+    A threshold finds no peak on the flank of a brighter star, and the light there moves the centre
+    of that star's fit.  What is nearer than 0.6 FWHM to a known source is not told from an error of
+    the PSF and left alone.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import build_epsf, detect_sources, fit_centroids
+    >>> from wpdc_gwcs.centroids import subtract_stars
+    >>> from wpdc_gwcs.detection import detect_companions, subtract_background
+    >>> rng = np.random.default_rng(1)
+    >>> y, x = np.mgrid[:200, :200]
+    >>> image = rng.normal(100, 5, x.shape)
+    >>> for x0, y0 in 20 * np.mgrid[1:10, 1:10].reshape(2, -1).T + rng.uniform(-2, 2, (81, 2)):
+    ...     image += 3000 * np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / 3)
+    >>> image += 300 * np.exp(-((x - x0 - 2.8) ** 2 + (y - y0) ** 2) / 3)  # beside the last one
+    >>> background = subtract_background(image)
+    >>> sources = detect_sources(background)
+    >>> epsf = build_epsf(background, sources)
+    >>> residual = subtract_stars(background, fit_centroids(background, sources, epsf), epsf)
+    >>> len(sources), len(detect_companions(residual, sources))
+    (81, 82)
+    """
+    if not threshold > 0:
+        raise ValueError(f"threshold must be positive, got {threshold}")
+    fwhm = sources.meta["fwhm"]
+    found = extract_peaks(residual, threshold, deblend_contrast, fwhm)
+    result = sources.copy()
+    if len(found):
+        new = _measure(residual, found, fwhm, gain, sources.meta["saturation"])
+        distance = KDTree(_places(sources)).query(_places(new))[0]
+        new = new[(distance > _RESOLVED * fwhm) & (new["flags"] & FLAG_SATURATED == 0)]
+        log.info("%d more sources beside those subtracted", len(new))
+        result = vstack([result, new], metadata_conflicts="silent")
+        result.meta.update(sources.meta)
+    blended = _blended(*(np.asarray(result[c], float) for c in ("x", "y", "flux")), fwhm)
+    result["flags"] = result["flags"] & ~FLAG_BLENDED | np.where(blended, FLAG_BLENDED, 0)
+    return result
+
+
+def _places(table):
+    return np.column_stack([table["x"], table["y"]])
+
+
+def _measure(background, found, fwhm, gain, saturation):
+    """Measure all sources; returns the table, in counts."""
+    image, rms, bad, unit = background.image, background.rms, background.mask, background.unit
+    gain = None if gain is None else gain * unit
+    sigma = fwhm * SIGMA_PER_FWHM
+    x, y = _windowed(background, found, sigma, fwhm)
+    radius = 1.5 * fwhm
+    flux, flux_err, _ = sep.sum_circle(image, x, y, radius, err=rms, mask=bad, gain=gain, subpix=5)
+    parts = [
+        measure_shapes(
+            background, x[k], y[k], found["xpeak"][k], found["ypeak"][k], fwhm, gain, saturation
+        )
+        for k in (slice(start, start + _CHUNK) for start in range(0, len(found), _CHUNK))
+    ]
+    shapes = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    flags = shapes.pop("flags")
+    minor, size = shapes.pop("minor"), shapes["fwhm"]
+    shapes["peak"] *= unit
+    flags |= _unlike_stars(minor, size, shapes["snr"], flags)
+    shapes["fwhm"] = np.where(np.isfinite(size), size, np.nan)
+    ellipticity = _ellipticity(minor, size, shapes["snr"], flags)
+    flags |= np.where(_blended(x, y, flux, fwhm), FLAG_BLENDED, 0)
+    return Table(
+        {"x": x, "y": y}
+        | {name: shapes.pop(name) for name in ("x_err", "y_err")}
+        | {"flux": flux * unit, "flux_err": flux_err * unit}
+        | shapes
+        | {"flags": flags},
+        meta={"ellipticity": ellipticity},
+    )
+
+
+def _windowed(background, found, sigma, fwhm):
+    """Windowed centroids; the isophotal ones where the window ran away to a neighbour."""
+    x, y = found["x"].astype(float), found["y"].astype(float)
+    xw, yw, _ = sep.winpos(
+        background.image, found["xcpeak"], found["ycpeak"], sigma, mask=background.mask, subpix=5
+    )
+    moved = np.hypot(xw - found["xcpeak"], yw - found["ycpeak"])
+    ran_away = ~(moved < 0.7 + 0.5 * fwhm)
+    away = ~(np.hypot(x - found["xcpeak"], y - found["ycpeak"]) < 0.7 + 0.5 * fwhm)
+    x[away], y[away] = found["xcpeak"][away], found["ycpeak"][away]
+    return np.where(ran_away, x, xw), np.where(ran_away, y, yw)
+
+
+def _ellipticity(minor, size, snr, flags):
+    """Find 1 - minor/major of a typical star, NaN without any."""
+    with np.errstate(invalid="ignore"):
+        value = 1 - minor / np.sqrt(2 * size**2 - minor**2)
+    good = (flags == 0) & (snr > _STAR_SNR) & np.isfinite(value)
+    return mode(value[good])[0] if good.any() else np.nan
+
+
+def _unlike_stars(minor, size, snr, flags):
+    """Flag what is clearly sharper or broader than the stars of this image."""
+    result = np.zeros(len(size), int)
+    bright = (flags == 0) & (snr > _STAR_SNR) & np.isfinite(size)
+    if bright.sum() < 10:
+        bright = (flags == 0) & np.isfinite(size)
+    if bright.sum() < 10:
+        return result
+    typical_size, size_scatter = mode(size[bright])
+    typical_minor, minor_scatter = mode(minor[bright])
+    # Relative error of a size from noise alone is about 1.4 / SNR under a matched window.
+    noise = 3 * 1.4 / np.maximum(snr, 1e-3)
+    with np.errstate(invalid="ignore"):
+        sharp = minor < typical_minor - np.maximum(
+            (0.25 + noise) * typical_minor, 5 * minor_scatter
+        )
+        broad = size > typical_size + np.maximum((0.2 + noise) * typical_size, 5 * size_scatter)
+    result[broad] = FLAG_EXTENDED
+    result[sharp] = FLAG_COSMIC
+    return result
+
+
+def _blended(x, y, flux, fwhm):
+    """Mark sources whose core holds more than a few per cent of a neighbour's light."""
+    blended = np.zeros(len(x), bool)
+    pairs = KDTree(np.column_stack([x, y])).query_pairs(4 * fwhm, output_type="ndarray")
+    if len(pairs) == 0:
+        return blended
+    i, j = pairs.T
+    distance = np.hypot(x[i] - x[j], y[i] - y[j]) / fwhm
+    # Moffat profile with beta = 2.5 of unit FWHM, relative to its peak.
+    light = (1 + (distance * 2) ** 2 * (2**0.4 - 1)) ** -2.5
+    flux = np.maximum(flux, 1e-6 * np.max(flux, initial=np.finfo(float).tiny))
+    share = np.zeros(len(x))
+    np.add.at(share, i, flux[j] / flux[i] * light)
+    np.add.at(share, j, flux[i] / flux[j] * light)
+    close = distance < 1.2
+    blended[i[close]] = blended[j[close]] = True
+    return blended | (share > _MAX_SHARE)

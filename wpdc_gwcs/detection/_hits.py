@@ -1,0 +1,112 @@
+"""Hits of cosmic rays and hot pixels: sharper than any star of the image can be."""
+
+import logging
+
+import numpy as np
+from scipy.special import erf
+
+from wpdc_gwcs.detection._extract import star_size
+
+__all__ = ["mask_hits"]
+
+log = logging.getLogger(__name__)
+
+# Pixels tested, in standard deviations of the background.
+_MIN_PEAK = 6.0
+
+# Peaks that tell the size of the stars, in standard deviations; and how many.
+_BRIGHT = 20.0
+_N_BRIGHT = 500
+
+# The sharpest profile that optics and pixels leave, FWHM in px: what is sharper is no star whatever
+# the size of the stars.  Beyond the broadest, hits are told by the same contrast.
+_SHARPEST, _BROADEST = 1.0, 2.5
+
+# Share of the expected light beside a peak below which it is a hit: profiles vary over the image.
+_MARGIN = 0.6
+
+# Standard deviations by which noise may take light from the pixels beside, or add to the peak.
+_NOISE = 2.5
+
+# Opposite neighbors in four directions.
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+
+
+def mask_hits(background):
+    r"""Mask the pixels that cosmic rays and defects have lit.
+
+    Parameters
+    ----------
+    background : Background
+        Image without background.
+
+    Returns
+    -------
+    Background
+        The same with these pixels masked too.
+
+    Notes
+    -----
+    A pixel is a hit where the mean of two opposite neighbors, in any of four directions, is lower
+    than a star centered on it would make it (as in the photometric pipeline of the SDSS, Lupton et
+    al. 2001, ASP Conf. 238, 269).  The stars' profile is taken for a Gaussian of the FWHM along the
+    minor axis of the image's own bright sources, once those that are sharper than 1 px are left
+    out, and the expected light is lowered by 40 % and by 2.5 standard deviations.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.detection import mask_hits, subtract_background
+    >>> y, x = np.mgrid[:200, :200]
+    >>> image = np.random.default_rng(1).normal(100, 5, x.shape)
+    >>> for x0, y0 in 20 * np.mgrid[1:10, 1:10].reshape(2, -1).T:
+    ...     image += 3000 * np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / 2)
+    >>> image[50, 70] += 1000
+    >>> background = mask_hits(subtract_background(image))
+    >>> np.argwhere(background.mask).tolist()
+    [[50, 70]]
+    """
+    image, rms = background.image, background.rms
+    bright = image > _MIN_PEAK * rms
+    bright[0] = bright[-1] = bright[:, 0] = bright[:, -1] = False
+    y, x = np.nonzero(bright)
+    if len(x) == 0:
+        return background
+    peak, noise = image[y, x], rms[y, x]
+    beside, against = (
+        np.array([image[y + s * j, x + s * i] for j, i in _DIRECTIONS]) for s in (1, -1)
+    )
+    pairs = 0.5 * (beside + against)
+    if background.mask is not None:
+        # Of a pair with a bad pixel the other says nothing: the star may be beside it.
+        for sign in (1, -1):
+            for pair, (j, i) in zip(pairs, _DIRECTIONS, strict=True):
+                pair[background.mask[y + sign * j, x + sign * i]] = np.inf
+    impossible = _sharper(peak, pairs, noise, _SHARPEST)
+    top = (peak > _BRIGHT * noise) & ~impossible
+    top &= (peak >= beside.max(axis=0)) & (peak >= against.max(axis=0))
+    rows = np.flatnonzero(top)
+    # The very brightest are saturated.
+    rows = rows[peak[rows] < 0.7 * peak.max()] if len(rows) > 10 else rows
+    rows = rows[np.argsort(peak[rows])[::-1][:_N_BRIGHT]]
+    size = star_size(image, x[rows].astype(float), y[rows].astype(float)) if len(rows) else None
+    hit = impossible
+    if size is not None:
+        hit |= _sharper(peak, pairs, noise, np.clip(size[1], _SHARPEST, _BROADEST))
+    if not hit.any():
+        return background
+    log.info("%d pixels masked as hits", np.count_nonzero(hit))
+    bad = np.zeros(image.shape, bool)
+    bad[y[hit], x[hit]] = True
+    return background.masked(bad)
+
+
+def _sharper(peak, pairs, noise, fwhm):
+    """Mark the peaks that are sharper than a star of this FWHM."""
+    root = np.sqrt(8 * np.log(2)) / fwhm / np.sqrt(2)
+    inner, outer = erf(0.5 * root), 0.5 * (erf(1.5 * root) - erf(0.5 * root))
+    ratio = outer / inner
+    # A diagonal step is one along each axis.
+    expected = np.array([_MARGIN * ratio] * 2 + [(_MARGIN * ratio) ** 2] * 2)[:, None]
+    light = pairs + _NOISE / np.sqrt(2) * noise
+    return (light < expected * (peak - _NOISE * noise)).any(axis=0)

@@ -1,0 +1,68 @@
+"""The level at which pixels are saturated."""
+
+import numpy as np
+
+__all__ = ["plateau", "saturation_problem"]
+
+# A level stated for saturation belongs to other pixels if the brightest exceed it so many times:
+# flat fields and stacks make less of it.
+_MAX_EXCESS = 3.0
+# Levels within so many standard deviations of the background are those of the sky.
+_ABOVE_SKY = 10.0
+
+
+def saturation_problem(background, saturation):
+    """Tell why a stated saturation level cannot be that of the pixels.
+
+    Parameters
+    ----------
+    background : Background
+        Image without background.
+    saturation : float
+        Counts, background included.
+
+    Returns
+    -------
+    str or None
+        The contradiction, None where there is none.
+    """
+    height = saturation - background.level
+    if not height > _ABOVE_SKY * background.noise:
+        return f"the sky of the image is at {background.level:.4g} +- {background.noise:.2g}"
+    highest = float(background.image.max()) * background.unit
+    if highest > _MAX_EXCESS * height:
+        return f"pixels of the image reach {highest + background.level:.4g}"
+    return None
+
+
+def plateau(background):
+    """Level at which the brightest pixels are cut off.
+
+    Parameters
+    ----------
+    background : Background
+        Image without background.
+
+    Returns
+    -------
+    float or None
+        Counts, background included; None where there is no such level.
+
+    Notes
+    -----
+    Peaks of stars are the rarer the brighter they are: pixels crowded at the very top have been cut
+    off there.
+    """
+    image = background.image
+    top = float(image.max())
+    if not top > 0:
+        return None
+    # Extremes of the image without background, which varies far less than stars' peaks.
+    high = image > 0.9 * top
+    values = background.data[high if background.mask is None else high & ~background.mask]
+    values = (values.astype(float) - background.level) / background.unit
+    limit = 0.999 * values.max(initial=0.0)
+    at_top = np.count_nonzero(values >= limit)
+    if at_top < max(5, 2 * (values.size - at_top)) or top < 50 * np.median(background.rms[::99]):
+        return None
+    return background.level + float(limit) * background.unit

@@ -1,0 +1,192 @@
+"""The exact WCS that exports are made from and measured against."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from astropy.io import fits
+from astropy.wcs import WCS
+
+from wpdc_gwcs.exceptions import FileFormatError
+from wpdc_gwcs.models import project
+
+__all__ = [
+    "ExactWCS",
+    "astropy_sky",
+    "astropy_wcs",
+    "description",
+    "deviation",
+    "image_shape_of",
+    "require_shape",
+    "sample_plane",
+]
+
+
+class ExactWCS(NamedTuple):
+    """Instrument, matrix (deg / px), reference point (deg) and name of what is exported."""
+
+    solution: object
+    cd: np.ndarray
+    crval: np.ndarray
+    frame: str
+
+
+def description(obj):
+    """Give instrument and attitude of a calibration, or of a solution about its nominal pointing.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        What is exported.
+
+    Returns
+    -------
+    exact : ExactWCS
+        Its parts.
+
+    Raises
+    ------
+    TypeError
+        If it is neither.
+    """
+    solution = getattr(obj, "solution", obj)
+    if not all(hasattr(solution, name) for name in ("crpix", "pv", "lookup_table")):
+        raise TypeError(f"must be a Calibration or a DistortionSolution, got {type(obj).__name__}")
+    return ExactWCS(solution, np.asarray(obj.cd), np.asarray(obj.crval), getattr(obj, "frame", ""))
+
+
+def image_shape_of(obj):
+    """Give the shape of the detector, (ny, nx); `None` where nothing tells.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        What is exported.
+
+    Returns
+    -------
+    shape : (int, int) or None
+        The nodes of a table run from edge to edge, so they tell, too.
+    """
+    shape, table = description(obj).solution.image_shape, obj.lookup_table
+    if shape is None and table is not None:
+        return tuple(round(grid[-1] - grid[0]) for grid in (table.y_grid, table.x_grid))
+    return shape
+
+
+def require_shape(obj):
+    """Give the shape of the detector, for formats that are fitted over it.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        What is exported.
+
+    Returns
+    -------
+    shape : (int, int)
+        As `image_shape_of`.
+
+    Raises
+    ------
+    FileFormatError
+        If it is unknown.
+    """
+    shape = image_shape_of(obj)
+    if shape is None:
+        raise FileFormatError("shape of the detector must be known for this format, is unknown")
+    return shape
+
+
+def deviation(obj, sky, *, n=401):
+    """Measure the greatest distance of another WCS from the exact one.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        The exact one.
+    sky : callable
+        ``sky(x, y)`` -> RA, Dec in deg of zero-based pixels.
+    n : int, optional
+        Points along each side of a grid from edge to edge.
+
+    Returns
+    -------
+    deviation : float
+        In undistorted pixels; NaN where the other has no answer counts as infinite.
+    """
+    exact = description(obj)
+    ny, nx = require_shape(obj)
+    x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, n), np.linspace(-0.5, ny - 0.5, n))
+    x, y = x.ravel(), y.ravel()
+    places = np.array(obj.undistort(x, y))
+    plane = np.array(project(*sky(x, y), exact.crval))
+    other = np.linalg.solve(exact.cd, plane) + np.asarray(exact.solution.crpix)[:, None]
+    distance = np.hypot(*(other - places))[np.isfinite(places).all(axis=0)]
+    return float(np.where(np.isfinite(distance), distance, np.inf).max(initial=0.0))
+
+
+def astropy_wcs(header, tables=()):
+    """Give what astropy.wcs makes of a header.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        The keywords.
+    tables : sequence of HDU, optional
+        Extensions that belong to them.
+
+    Returns
+    -------
+    wcs : `~astropy.wcs.WCS`
+        With the tables.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return WCS(header, fits.HDUList([fits.PrimaryHDU(), *tables]))
+
+
+def astropy_sky(header, tables=()):
+    """Give what astropy.wcs makes of a header, as a function of zero-based pixels.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        The keywords.
+    tables : sequence of HDU, optional
+        Extensions that belong to them.
+
+    Returns
+    -------
+    sky : callable
+        ``sky(x, y) -> ra, dec``.
+    """
+    wcs = astropy_wcs(header, tables)
+
+    def sky(x, y):
+        return wcs.all_pix2world(x, y, 0)
+
+    return sky
+
+
+def sample_plane(obj):
+    """Give pixels all over the detector and where they are on the tangent plane, for a fit.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        What is exported.
+
+    Returns
+    -------
+    pixels, plane : (2, N) ndarray
+        Zero-based pixels; standard coordinates, deg.
+    """
+    exact = description(obj)
+    ny, nx = require_shape(obj)
+    # Chebyshev points make least squares nearly the best approximation in the greatest error.
+    t = np.cos(np.pi * (np.arange(64) + 0.5) / 64)
+    x, y = np.meshgrid(0.5 * (nx - 1) + 0.5 * nx * t, 0.5 * (ny - 1) + 0.5 * ny * t)
+    x, y = x.ravel(), y.ravel()
+    places = np.array(obj.undistort(x, y)) - np.asarray(exact.solution.crpix)[:, None]
+    return np.array([x, y]), exact.cd @ places

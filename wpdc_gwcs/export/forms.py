@@ -1,0 +1,122 @@
+"""One calibration in the forms that readers of FITS know.
+
+========= ============================================================== =======================
+form      content                                                        exact for
+========= ============================================================== =======================
+``fits``  TPV keywords, BINTABLE ``WPDC_LUT``                            this package, all of it
+``cpdis`` TPV keywords, ``CPDIS`` look-up tables in front of CD and PV   astropy, to 1e-3 px
+``tpv``   TPV keywords fitted to everything                              by what is told
+``head``  the same as text                                               the same
+``sip``   SIP polynomials fitted to everything                           by what is told
+``tab``   ``-TAB`` table                                                 wcslib, to 1e-3 px
+========= ============================================================== =======================
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from astropy.io import fits
+
+from wpdc_gwcs.export.cpdis import cpdis_form
+from wpdc_gwcs.export.exact import astropy_sky, deviation, image_shape_of
+from wpdc_gwcs.export.own import own_tables
+from wpdc_gwcs.export.sip import sip_keywords
+from wpdc_gwcs.export.tab import TAB_NAME, tab_form
+from wpdc_gwcs.export.tpv import fit_tpv, fold_polynomial, refit, tpv_keywords
+
+__all__ = ["FORMS", "FitsForm", "make_form"]
+
+#: Forms of `make_form`.
+FORMS = ("fits", "cpdis", "tpv", "head", "sip", "tab")
+
+
+@dataclass(frozen=True, eq=False)
+class FitsForm:
+    """The WCS of a calibration as FITS keywords, with the tables that they refer to.
+
+    Parameters
+    ----------
+    form : str
+        One of `FORMS`.
+    header : `~astropy.io.fits.Header`
+        WCS keywords alone.
+    tables : tuple of HDU
+        Extensions that readers of the form need.
+    deviation : float or None
+        Greatest deviation from the exact WCS over the detector for these readers, px; `None` where
+        it is exact, or where the shape of the detector is unknown.
+    keywords_deviation : float or None
+        For ``fits``: the same for readers of the keywords alone.
+    inverse_deviation : float or None
+        For ``sip``: greatest deviation of the inverse polynomials, px.
+    written : Calibration or DistortionSolution or None
+        For ``fits`` and ``cpdis``: the same mapping with the polynomial that the keywords have.
+    """
+
+    form: str
+    header: fits.Header
+    tables: tuple = ()
+    deviation: float | None = None
+    keywords_deviation: float | None = None
+    inverse_deviation: float | None = None
+    written: object = None
+
+
+def make_form(obj, form, *, degree=None, versions: Mapping = MappingProxyType({})):
+    """Give the WCS of a calibration in a form of FITS.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        What is exported; a solution about its nominal pointing.
+    form : {"fits", "cpdis", "tpv", "head", "sip", "tab"}
+        The form.
+    degree : int, optional
+        Degree of the polynomials.  By default that of the solution for ``fits`` and ``cpdis``, for
+        ``tpv``, ``head`` and ``sip`` the lowest that is good to 1e-3 px or nearly as good as any.
+    versions : mapping of str to int, optional
+        EXTVER of the first table of each EXTNAME, for files that have such tables already.
+
+    Returns
+    -------
+    made : FitsForm
+        Keywords, tables and deviations.
+
+    Raises
+    ------
+    ValueError
+        If the form is unknown, has no polynomials or not of this degree.
+    FileFormatError
+        If the shape of the detector is needed and unknown.
+    """
+    if form not in FORMS:
+        raise ValueError(f"format must be one of {', '.join(FORMS)}, got {form!r}")
+    if form in ("tpv", "head"):
+        pv, worst = fit_tpv(obj, degree)
+        return FitsForm(form, tpv_keywords(obj, pv), deviation=worst)
+    if form == "sip":
+        header, worst, inverse_worst = sip_keywords(obj, degree)
+        return FitsForm(form, header, deviation=worst, inverse_deviation=inverse_worst)
+    if form == "tab":
+        if degree is not None:
+            raise ValueError(f"degree has no meaning for 'tab', which has no polynomials: {degree}")
+        header, tables, worst = tab_form(obj, version=versions.get(TAB_NAME, 1))
+        return FitsForm(form, header, tuple(tables), worst)
+    written = obj if degree is None else refit(obj, degree)
+    if form == "cpdis":
+        header, tables, _ = cpdis_form(written, first_version=versions.get("WCSDVARR", 1))
+        worst = deviation(obj, astropy_sky(header, tables))
+        return FitsForm(form, header, tuple(tables), worst, written=written)
+    version = versions.get("WPDC_LUT", 1)
+    header = tpv_keywords(written, fold_polynomial(written))
+    header["WPDCTAB"] = (version, "EXTVER of the tables WPDC_...")
+    known = image_shape_of(obj) is not None
+    return FitsForm(
+        form,
+        header,
+        tuple(own_tables(written, version=version)),
+        None if degree is None else deviation(obj, lambda x, y: written.wcs(x, y)),
+        deviation(obj, astropy_sky(header)) if known else None,
+        written=written,
+    )

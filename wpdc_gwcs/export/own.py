@@ -1,0 +1,65 @@
+"""The tables of this package in FITS files: the look-up table as in the paper, the instrument."""
+
+import numpy as np
+from astropy.io import fits
+
+from wpdc_gwcs.export.exact import description
+
+__all__ = ["INSTRUMENT_NAME", "TABLE_COLUMNS", "TABLE_NAME", "own_tables"]
+
+#: EXTNAMEs and columns.
+TABLE_NAME = "WPDC_LUT"
+INSTRUMENT_NAME = "WPDC_INSTRUMENT"
+TABLE_COLUMNS = ("X_GRID", "Y_GRID", "DX_LUT", "DY_LUT")
+
+
+def own_tables(obj, *, version=1):
+    """Make the tables that bring the instrument back exactly.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        What is exported.
+    version : int, optional
+        EXTVER of the tables.
+
+    Returns
+    -------
+    tables : list of `~astropy.io.fits.BinTableHDU`
+        The instrument, and the look-up table where there is one.
+
+    Notes
+    -----
+    ``WPDC_LUT`` has one row for each node, x running fastest: ``X_GRID``, ``Y_GRID`` in FITS pixels
+    (from one) and ``DX_LUT``, ``DY_LUT``, px, to be subtracted from the undistorted position.  The
+    one row of ``WPDC_INSTRUMENT`` has CD0, PV0, the zero-based CRPIX and the nominal CRVAL as they
+    are, so that what is read back is the same to the last bit.
+    """
+    solution = description(obj).solution
+    pv, table = solution.pv, obj.lookup_table
+    values = {
+        "CRPIX": ("2D", "pixel", solution.crpix),
+        "CD": ("4D", "deg/pixel", solution.cd),
+        "CRVAL": ("2D", "deg", solution.crval),
+        "DEGREE": ("1J", None, pv.degree),
+        "RADIAL": ("1L", None, pv.radial),
+        "PV": (f"{pv.coefficients.size}D", "deg", pv.coefficients),
+    }
+    columns = [
+        fits.Column(name, form, unit=unit, array=np.asarray(value).reshape(1, -1))
+        for name, (form, unit, value) in values.items()
+    ]
+    instrument = fits.BinTableHDU.from_columns(columns, name=INSTRUMENT_NAME, ver=version)
+    instrument.header.add_comment("CRPIX counts from zero; PV: axis 1, axis 2, by FITS index")
+    if table is None:
+        return [instrument]
+    x, y = np.meshgrid(table.x_grid + 1.0, table.y_grid + 1.0)
+    columns = [
+        fits.Column(name, "D", unit="pixel", array=np.asarray(value).ravel())
+        for name, value in zip(TABLE_COLUMNS, (x, y, table.dx, table.dy), strict=True)
+    ]
+    nodes = fits.BinTableHDU.from_columns(columns, name=TABLE_NAME, ver=version)
+    nodes.header["METHOD"] = (table.method, "interpolation between the nodes")
+    nodes.header["NXGRID"] = (len(table.x_grid), "nodes along x, which runs fastest")
+    nodes.header["NYGRID"] = (len(table.y_grid), "nodes along y")
+    return [instrument, nodes]

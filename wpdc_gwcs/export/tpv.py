@@ -1,0 +1,176 @@
+"""TPV: the polynomial of a calibration as it is, or fitted to everything.
+
+::
+
+    sky = TAN^-1( PV(U) ) about CRVAL,    U = CD (x - CRPIX)
+"""
+
+import dataclasses
+
+import numpy as np
+
+from wpdc_gwcs.exceptions import FileFormatError
+from wpdc_gwcs.export.cards import linear_cards, number_card
+from wpdc_gwcs.export.exact import (
+    astropy_sky,
+    description,
+    deviation,
+    image_shape_of,
+    require_shape,
+    sample_plane,
+)
+from wpdc_gwcs.models import LookupTable, PVPolynomial, pv_terms
+from wpdc_gwcs.models.attitude import fold_attitude
+from wpdc_gwcs.models.powers import fit_polynomial, shift_origin
+
+__all__ = ["fit_tpv", "fold_polynomial", "refit", "tpv_keywords"]
+
+# A fit this good (px) is good enough; a higher degree would only be harder to read.
+_ENOUGH_PX = 1e-3
+# Where none is, the lowest degree that is as good as the best but for so much.
+_NEARLY = 1.1
+_DEGREES = range(1, 8)
+# Nodes along each axis of the table of what a polynomial leaves, where there was none.
+_TABLE_NODES = 50
+
+
+def fold_polynomial(obj):
+    """Give the polynomial of a calibration in the matrix of its exposure.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        What is exported.
+
+    Returns
+    -------
+    pv : PVPolynomial
+        ``PV(U) = A PV0(A^-1 U)``, ``A = CD CD0^-1``; exact.
+    """
+    exact = description(obj)
+    nominal = np.asarray(exact.solution.cd)
+    if np.array_equal(exact.cd, nominal):
+        return exact.solution.pv
+    return fold_attitude(exact.solution.pv, np.linalg.solve(nominal.T, exact.cd.T).T)
+
+
+def tpv_keywords(obj, pv):
+    """Give the header of a polynomial in the matrix of the exposure.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        Where CRPIX, CD and CRVAL are from.
+    pv : PVPolynomial
+        The polynomial.
+
+    Returns
+    -------
+    header : `~astropy.io.fits.Header`
+        Numbers with 17 digits.
+    """
+    exact = description(obj)
+    header = linear_cards("TPV", exact.solution.crpix, exact.cd, exact.crval)
+    for axis in (1, 2):
+        for j, value in zip(pv.term_indices, pv.coefficients[axis - 1], strict=True):
+            header.append(number_card(f"PV{axis}_{j}", value, "[deg] distortion"), end=True)
+    return header
+
+
+def fit_tpv(obj, degree=None):
+    """Find the polynomial that is nearest to the whole mapping, look-up table included.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        What is exported.
+    degree : int, optional
+        Degree, 1 to 7.  By default the lowest that comes within 1e-3 px everywhere, or else the
+        lowest that is nearly as good as any; without a table, the polynomial itself.
+
+    Returns
+    -------
+    pv : PVPolynomial
+        In the matrix of the exposure.
+    deviation : float or None
+        Greatest deviation from the exact WCS, px; `None` where the shape of the detector is
+        unknown.
+
+    Raises
+    ------
+    ValueError
+        If the degree is not from 1 to 7.
+    """
+    if degree is not None and degree not in _DEGREES:
+        raise ValueError(f"degree must be from 1 to 7 for TPV, got {degree}")
+    if degree is None and obj.lookup_table is None:
+        try:
+            pv = fold_polynomial(obj)
+        except FileFormatError:
+            # Radial terms cannot be sheared; a polynomial comes near.
+            require_shape(obj)
+        else:
+            return pv, None if image_shape_of(obj) is None else _tpv_deviation(obj, pv)
+    samples = sample_plane(obj)
+    trials = []
+    for n in _DEGREES if degree is None else [degree]:
+        pv = _fit(obj, *samples, n)
+        trials.append((_tpv_deviation(obj, pv, n=151), pv))
+        if trials[-1][0] <= _ENOUGH_PX:
+            break
+    best = min(worst for worst, _ in trials)
+    limit = max(_NEARLY * best, _ENOUGH_PX)
+    pv = next(pv for worst, pv in trials if worst <= limit)
+    return pv, _tpv_deviation(obj, pv)
+
+
+def refit(obj, degree):
+    """Write the same mapping with a polynomial of another degree and a table of what it leaves.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        What is exported.
+    degree : int
+        Degree, 1 to 7.
+
+    Returns
+    -------
+    again : Calibration or DistortionSolution
+        With the nodes of the table of ``obj``, or 50 along each axis.
+    """
+    exact = description(obj)
+    ny, nx = require_shape(obj)
+    pv, _ = fit_tpv(obj, degree)
+    table = obj.lookup_table
+    if table is None:
+        grids = [np.linspace(-0.5, n - 0.5, _TABLE_NODES) for n in (nx, ny)]
+    else:
+        grids = [table.x_grid, table.y_grid]
+    x, y = np.meshgrid(*grids)
+    crpix = np.reshape(exact.solution.crpix, (2, 1))
+    plane = np.array(pv(*(exact.cd @ (np.array([x.ravel(), y.ravel()]) - crpix))))
+    polynomial = np.linalg.solve(exact.cd, plane) + crpix
+    dx, dy = (polynomial - obj.undistort(x.ravel(), y.ravel())).reshape(2, *x.shape)
+    method = "cubic" if min(x.shape) >= 4 else "linear"
+    solution = dataclasses.replace(
+        exact.solution, cd=exact.cd, pv=pv, lookup_table=LookupTable(*grids, dx, dy, method=method)
+    )
+    if exact.solution is obj:
+        return solution
+    return dataclasses.replace(obj, solution=solution, field=None)
+
+
+def _tpv_deviation(obj, pv, **options):
+    return deviation(obj, astropy_sky(tpv_keywords(obj, pv)), **options)
+
+
+def _fit(obj, pixels, plane, degree):
+    exact = description(obj)
+    u = exact.cd @ (pixels - np.reshape(exact.solution.crpix, (2, 1)))
+    polynomial = shift_origin(*fit_polynomial(u, plane, degree))
+    terms = pv_terms(degree)
+    coefficients = np.array(
+        [polynomial[0, terms.own, terms.other], polynomial[1, terms.other, terms.own]]
+    )
+    return PVPolynomial.from_coefficients(coefficients, degree=degree)

@@ -1,0 +1,422 @@
+"""Images that go with an image: masks, weights, errors, times, known by name, place and pixels.
+
+::
+
+    SCI, ERR, DQ | IMAGE, MSK, WGT | x.SCI, x.RMS, x.FLG | ... --pair_companions--> frames
+    of each frame: mask and weight, read when they are needed (`load_mask`, `load_weight`)
+"""
+
+import logging
+import re
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from wpdc_gwcs.exceptions import FrameError, WPDCWarning
+from wpdc_gwcs.io.files import READ_ERRORS, first_line, open_fits, split_extension
+from wpdc_gwcs.io.headers import find_extension, header_text
+from wpdc_gwcs.robust import robust_scatter
+
+__all__ = [
+    "Companion",
+    "data_section",
+    "given_plane",
+    "load_mask",
+    "load_weight",
+    "pair_companions",
+]
+
+log = logging.getLogger(__name__)
+
+# Words of extension names, by what the pixels say; the first family that has one wins.
+_ROLES = {
+    "mask": "DQ DQM DQF MASK MSK BPM BAD BADPIX FLAG FLAGS FLG QUALITY QUAL DEFECTS",
+    "weight": "WHT WGT WEIGHT WEIGHTS WMAP IVAR INVVAR INVERSE INV",
+    "error": "ERR ERROR ERRORS RMS SIGMA SIG NOISE UNC UNCERT UNCERTAINTY STD STDDEV STDEV",
+    "variance": "VAR VARIANCE",
+    "other": "SAMP TIME EXP EXPTIME EXPMAP EXPOSURE COV COVERAGE CON CTX CONTEXT NCOMBINE NCOMB "
+    "BKG BKGD BACKGROUND SKY MODEL RESIDUAL RESID AREA PSF OOD IMARR WCSDVARR DVARR",
+}
+_ROLES = {role: frozenset(words.split()) for role, words in _ROLES.items()}
+# Longer words count within others too (BADPIXELMASK, WEIGHTMAP).
+_LONGEST_PLAIN = 3
+_SCIENCE = frozenset(("SCI", "SCIENCE", "IMAGE", "IMG", "DATA", "PRIMARY", "COMPRESSED"))
+# The standard of HDUCLASS says it in so many words.
+_CLASSES = {"ERROR": "error", "QUALITY": "mask", "WEIGHT": "weight"}
+_CLASS_VALUES = {"MSE": "variance", "RMSE": "error", "INVMSE": "weight", "INVRMSE": "other"}
+
+# Keywords that two extensions of one detector share, and two detectors do not.
+_IDENTITY = ("CCDNAME", "CHIPNAME", "DETNAME", "DETECTOR", "CHIPID", "CCDNUM", "CCDCHIP", "DETSEC")
+_WCS_KEYS = ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2", "CD1_1", "CD1_2", "PC1_1", "CDELT1")
+
+# Planes of a mask by name (Rubin and its relatives, MP_name) that make a pixel useless; the others
+# say where sources are, or what was done with them.
+_BAD_PLANES = frozenset(
+    "BAD SAT INTRP CR EDGE NO_DATA SUSPECT UNMASKEDNAN CROSSTALK VIGNETTED".split()
+)
+# Telescopes whose lowest bit sums up the others.
+_DO_NOT_USE = ("JWST", "ROMAN")
+
+# A bit is looked at before it is believed if more than this share of the pixels has it: for marking
+# sources, and for saying nothing, which it can only for areas that no defects cover.
+_FEW, _SHARE = 0.001, 0.05
+# Pixels like the rest: their median to a standard deviation, their scatter within a factor, their
+# share of outliers within a factor and a floor.
+_MEDIAN, _SCATTER, _OUTLIERS, _OUTLIER_FLOOR = 1.0, 1.4, 2.0, 0.003
+_N_SAMPLE = 200_000
+# A bit of sources: its pixels lie side by side and are most of those that are bright (in standard
+# deviations), but not so bright that they are saturated.
+_BRIGHT, _TOO_BRIGHT, _OF_SOURCES, _CONNECTED = 5.0, 50.0, 0.5, 0.7
+
+
+@dataclass(frozen=True)
+class Companion:
+    """An image extension that goes with another one.
+
+    Parameters
+    ----------
+    path : str
+        File.
+    index : int
+        Number of the extension.
+    role : {"mask", "weight", "error", "variance", "other"}
+        What its pixels say.
+    given : bool, optional
+        Whether the user named it: then all that it marks is bad.
+    """
+
+    path: str
+    index: int
+    role: str
+    given: bool = False
+
+
+def pair_companions(hdus, images, path):
+    """Tell frames from what goes with them.
+
+    Parameters
+    ----------
+    hdus : `~astropy.io.fits.HDUList`
+        The open file.
+    images : list of int
+        Extensions that are images.
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    dict
+        Extension of each frame to the list of its companions, in the order of the file.
+
+    Notes
+    -----
+    A companion is known by a word of its name or by the standard of ``HDUCLASS``; without either,
+    by the WCS of a frame of another name, which no two detectors have in common.
+    """
+    roles = {i: _role_of(hdus[i]) for i in images}
+    main = [i for i in images if roles[i] is None] or list(images)
+    frames = {}
+    for i in main:
+        twin = next((f for f in frames if _is_twin(hdus[f], hdus[i])), None)
+        if twin is None:
+            frames[i] = []
+        else:
+            roles[i] = "mask" if _looks_like_mask(hdus[i]) else "other"
+    for i in images:
+        near = [f for f in frames if _shape(hdus[f]) == _shape(hdus[i])]
+        if i in frames or not near:
+            continue
+        best = max(near, key=lambda f, i=i: (*_kinship(hdus[f], hdus[i]), f < i, -abs(i - f)))
+        frames[best].append(Companion(str(path), i, roles[i] or "other"))
+    return frames
+
+
+def _shape(hdu):
+    return tuple(hdu.header.get(f"NAXIS{k}") for k in (1, 2))
+
+
+def _words(hdu):
+    return re.findall(r"[A-Z]+|\d+", hdu.name.upper())
+
+
+def _role_of(hdu):
+    """Role by class or name; `None` for a frame."""
+    for key in ("HDUCLAS3", "HDUCLAS2"):
+        text = header_text(hdu.header, key).upper()
+        if text in _CLASS_VALUES or text in _CLASSES:
+            return _CLASS_VALUES.get(text) or _CLASSES[text]
+    for role, names in _ROLES.items():
+        for word in _words(hdu):
+            longer = [n for n in names if len(n) > _LONGEST_PLAIN and role != "other"]
+            if word in names or any(n in word for n in longer):
+                return role
+    return None
+
+
+def _kinship(frame, other):
+    """Rank of how surely two extensions belong together."""
+    rest = [
+        [w for w in _words(h) if w not in _SCIENCE and not any(w in n for n in _ROLES.values())]
+        for h in (frame, other)
+    ]
+    return rest[0] == rest[1], frame.ver == other.ver, _same(frame, other, _WCS_KEYS)
+
+
+def _same(one, other, keys):
+    return all(one.header.get(k) == other.header.get(k) for k in keys)
+
+
+def _is_twin(frame, other):
+    """Whether an extension has the WCS of a frame, and nothing says that it is another detector."""
+    if _shape(frame) != _shape(other) or "CRVAL1" not in other.header:
+        return False
+    if not (_same(frame, other, _WCS_KEYS) and _same(frame, other, _IDENTITY)):
+        return False
+    # Numbers apart, detectors of one camera have one name.
+    kind = [[w for w in _words(h) if not w.isdigit()] for h in (frame, other)]
+    return kind[0] != kind[1]
+
+
+def _looks_like_mask(hdu):
+    """Whether pixels are whole numbers, most of them zero."""
+    if hdu.header.get("BITPIX", -32) < 0:
+        return False
+    try:
+        return bool(np.mean(np.asarray(hdu.data) == 0) > 0.5)
+    except READ_ERRORS:
+        return False
+
+
+def given_plane(path, frame_index, frame_name, shape, role):
+    """Find the mask or the weight that a file has for a frame.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS image, ``path`` or ``path[EXT]``; of several images the one with the name or, failing
+        that, the number of the frame's extension is taken.
+    frame_index : int
+        Extension of the frame.
+    frame_name : str
+        Its name.
+    shape : (int, int)
+        Shape of the frame.
+    role : {"mask", "weight"}
+        What it is wanted for; a map named after errors or variances is taken as such.
+
+    Returns
+    -------
+    Companion
+        Where it is.
+
+    Raises
+    ------
+    FrameError
+        If there is none of the frame's shape.
+    """
+    plain, extension = split_extension(path)
+    with open_fits(plain, error=FrameError) as hdus:
+        images = [i for i, h in enumerate(hdus) if h.is_image and h.header.get("NAXIS", 0) >= 2]
+        if extension is not None:
+            index = find_extension(hdus, extension, plain, error=FrameError)
+        elif len(images) == 1:
+            index = images[0]
+        else:
+            named = [i for i in images if frame_name and hdus[i].name == frame_name.upper()]
+            index = named[0] if len(named) == 1 else frame_index
+        if index not in images:
+            raise FrameError(f"{path}: has no image for extension {frame_index} of the frame")
+        found = _shape(hdus[index])[::-1]
+        if found != tuple(shape):
+            raise FrameError(
+                f"{plain}[{index}]: {role} must have the shape (ny, nx) {tuple(shape)} of the "
+                f"frame, has {found}"
+            )
+        own = _role_of(hdus[index])
+    if role == "weight" and own in ("error", "variance"):
+        role = own
+    return Companion(str(plain), index, role, given=True)
+
+
+def data_section(header, shape):
+    """Part of an image that has seen the sky, by DATASEC or TRIMSEC.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        Header of the image.
+    shape : (int, int)
+        Its shape.
+
+    Returns
+    -------
+    (slice, slice) or None
+        Rows and columns; `None` where it is all of the image, or where the section is that of
+        other pixels (those before a trim, for example).
+    """
+    for key in ("DATASEC", "TRIMSEC"):
+        match = re.fullmatch(
+            r"\[\s*(\d+)\s*:\s*(\d+)\s*,\s*(\d+)\s*:\s*(\d+)\s*\]", header_text(header, key)
+        )
+        if match is None:
+            continue
+        x0, x1, y0, y1 = (int(v) for v in match.groups())
+        (x0, x1), (y0, y1) = sorted((x0, x1)), sorted((y0, y1))
+        ny, nx = shape
+        inside = x0 >= 1 and y0 >= 1 and x1 <= nx and y1 <= ny
+        area = (x1 - x0 + 1) * (y1 - y0 + 1)
+        if inside and 0.5 * nx * ny <= area < nx * ny:
+            return slice(y0 - 1, y1), slice(x0 - 1, x1)
+    return None
+
+
+def load_mask(masks, section, shape, bits, load_image):
+    """Read the pixels that must not be used.
+
+    Parameters
+    ----------
+    masks : sequence of Companion
+        Masks.
+    section : (slice, slice) or None
+        Part of the image that has seen the sky.
+    shape : (int, int)
+        Shape of the image.
+    bits : int or None
+        Bits that are bad; `None`: those that the header names, or all but those whose pixels are
+        like the rest, or that mark sources.
+    load_image : callable
+        Returns the image.
+
+    Returns
+    -------
+    (ny, nx) ndarray of bool
+        True where bad.
+    """
+    bad = np.zeros(shape, bool)
+    for mask in masks:
+        values, header = _read(mask, shape)
+        values = np.where(np.isfinite(values), values, 0).astype(np.int64)
+        bad |= _bad_pixels(values, header, bits, load_image, mask)
+    if section is not None:
+        outside = np.ones(shape, bool)
+        outside[section] = False
+        bad |= outside
+    return bad
+
+
+def _bad_pixels(values, header, bits, load_image, mask):
+    if bits is not None:
+        return values & bits != 0
+    if mask.given or not values.any():
+        return values != 0
+    where = f"{mask.path}[{mask.index}]"
+    named = {k[3:]: v for k, v in header.items() if k.startswith("MP_") and isinstance(v, int)}
+    if named:
+        bits = sum(1 << v for name, v in named.items() if name in _BAD_PLANES)
+        return values & bits != 0
+    if header_text(header, "TELESCOP").upper() in _DO_NOT_USE:
+        return values & 1 != 0
+    different = np.unique(values)
+    if len(different) == 2 and different[0] == 0 and np.mean(values != 0) > 0.5:
+        return values == 0  # ones for the good
+    present = int(np.bitwise_or.reduce(values, axis=None))
+    bad = np.zeros(values.shape, bool)
+    clean, image = values == 0, None
+    for bit in (1 << k for k in range(63) if present >> k & 1):
+        has = values & bit != 0
+        if has.mean() > _FEW:
+            image = load_image() if image is None else image
+            alone = values == bit
+            if _says_nothing(image, has, alone if alone.any() else has, clean):
+                log.info("%s: bit %d is ignored: its pixels are good", where, bit)
+                continue
+        bad |= has
+    if bad.all():
+        warnings.warn(f"{where}: marks all pixels as bad, and is left aside", WPDCWarning)
+        return ~bad
+    return bad
+
+
+def _says_nothing(image, has, alone, clean):
+    """Whether the pixels that have a bit are like those that have none, or are those of sources.
+
+    The bit alone is compared, where others are not the reason for what the pixels look like.
+    """
+    rest = _sample(image[clean])
+    if rest.size < 100:
+        return False
+    middle, scatter = _spread(rest)
+    own = _sample(image[alone])
+    if own.size < 100 or not scatter > 0:
+        return False
+    level, spread = _spread(own)
+    bright = (image > middle + _BRIGHT * scatter) & (image < middle + _TOO_BRIGHT * scatter)
+    beside = (has[:, 1:] & has[:, :-1]).sum() / max(has.sum(), 1)
+    if bright.any() and np.mean(has[bright]) > _OF_SOURCES and beside > _CONNECTED:
+        return True
+    if has.mean() < _SHARE:
+        return False
+    outliers = [np.mean(np.abs(v - middle) > _BRIGHT * scatter) for v in (own, rest)]
+    return bool(
+        abs(level - middle) < _MEDIAN * scatter
+        and scatter / _SCATTER < spread < scatter * _SCATTER
+        and outliers[0] < _OUTLIERS * outliers[1] + _OUTLIER_FLOOR
+    )
+
+
+def _sample(values):
+    values = values[:: max(1, values.size // _N_SAMPLE)].astype(float)
+    return values[np.isfinite(values)]
+
+
+def _spread(values):
+    return np.median(values), robust_scatter(values)
+
+
+def load_weight(companion, shape):
+    """Read inverse variances.
+
+    Parameters
+    ----------
+    companion : Companion
+        Weight, error or variance.
+    shape : (int, int)
+        Shape of the image.
+
+    Returns
+    -------
+    (ny, nx) float32 ndarray or None
+        Weights of any scale, zero where a pixel must not be used; `None`, with a warning, where
+        hardly any pixel has one.
+    """
+    values, _ = _read(companion, shape)
+    values = values.astype(np.float64)
+    good = np.isfinite(values) & (values > 0)
+    if good.mean() < 0.05:
+        warnings.warn(
+            f"{companion.path}[{companion.index}]: {companion.role} must be positive, is so for "
+            f"{good.mean():.1%} of the pixels, and is left aside",
+            WPDCWarning,
+        )
+        return None
+    # By their median, so that squares stay within float32 in any unit.
+    values = np.where(good, values / np.median(values[good]), 0.0)
+    power = {"weight": 1, "variance": -1, "error": -2}[companion.role]
+    with np.errstate(divide="ignore"):
+        return np.where(good, values**power, 0.0).astype(np.float32)
+
+
+def _read(companion, shape):
+    """Pixels and header of a companion."""
+    where = f"{companion.path}[{companion.index}]"
+    with open_fits(companion.path, error=FrameError) as hdus:
+        hdu = hdus[companion.index]
+        header = hdu.header.copy()
+        if "TELESCOP" not in header and "TELESCOP" in hdus[0].header:
+            header["TELESCOP"] = hdus[0].header["TELESCOP"]
+        try:
+            data = np.array(hdu.data)
+        except READ_ERRORS as problem:
+            raise FrameError(f"{where}: damaged image: {first_line(problem)}") from problem
+    return data.reshape(shape), header

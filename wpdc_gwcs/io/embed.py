@@ -1,0 +1,338 @@
+"""A WCS into the image itself: cards and tables are exchanged, every other byte is copied.
+
+::
+
+    image --parts--> [header, data] ...   cards of the old WCS  -->  cards of the new one
+                                          tables of the old one -->  tables of the new one
+"""
+
+import contextlib
+import dataclasses
+import io
+import os
+import shutil
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from astropy.io import fits
+
+from wpdc_gwcs import __version__
+from wpdc_gwcs.exceptions import FileFormatError, InputError, WPDCWarning
+from wpdc_gwcs.export import FORMAT_VERSION, deviation, image_shape_of, make_form
+from wpdc_gwcs.export.exact import astropy_sky
+from wpdc_gwcs.io.checksum import checksum_text, sum_words
+from wpdc_gwcs.io.files import (
+    READ_ERRORS,
+    atomic_path,
+    check_output,
+    file_kind,
+    first_line,
+    open_fits,
+    open_stream,
+    split_extension,
+)
+from wpdc_gwcs.io.fits import warn_if_far
+from wpdc_gwcs.io.headers import extension_names, find_extension, header_shape, header_value
+from wpdc_gwcs.io.stale import alternates_of, is_stale, tables_of
+
+__all__ = ["INTO_FORMS", "write_into"]
+
+#: Forms that an image can have.
+INTO_FORMS = ("tpv", "sip", "cpdis", "fits", "tab")
+_BLOCK = 2880
+_CHUNK = 1 << 24
+# The written file is read back: it must be as good as it was said to be, but for rounding.
+_READ_BACK = 1.1
+_ROUNDING_PX = 1e-5
+
+
+class _Part(NamedTuple):
+    """One HDU of a file: where its header and its data stand, and what it is."""
+
+    header: fits.Header
+    start: int
+    data: int
+    end: int
+    name: tuple[str, int]
+
+
+def write_into(
+    obj, image, *, form="tpv", degree=None, output=None, alternates="keep", overwrite=False
+):
+    """Write the WCS of a calibration into an image, in one step.
+
+    Parameters
+    ----------
+    obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
+        The calibration.
+    image : path-like
+        FITS image, ``path[EXT]`` where there are several in the file; tile-compressed or compressed
+        as a whole, too.
+    form : {"tpv", "sip", "cpdis", "fits", "tab"}, optional
+        See `wpdc_gwcs.export.make_form`.
+    degree : int, optional
+        Degree of the polynomials.
+    output : path-like, optional
+        Copy to write; by default the image itself is replaced.
+    alternates : {"keep", "remove"}, optional
+        What becomes of alternate WCSs (``CTYPE1A``...).  Those that use the SIP terms of the old
+        WCS are removed in any case.
+    overwrite : bool, optional
+        Whether an existing copy may be replaced.
+
+    Returns
+    -------
+    made : `~wpdc_gwcs.export.FitsForm`
+        What was written.
+
+    Raises
+    ------
+    InputError
+        If the file is no such image, of another shape than the detector, or cannot be written.
+    ValueError
+        If a choice is unknown.
+
+    Warns
+    -----
+    WPDCWarning
+        If alternates are removed that use SIP, or a table cannot be made dense enough.
+
+    Notes
+    -----
+    All terms of the old WCS are removed: CD, PC, CDELT, CROTA, PV, PS, SIP, CPDIS, D2IM, plate
+    solutions, LONPOLE and so on, with the tables that they refer to unless another image of the
+    file needs them.  All other cards, the data, and all other HDUs are copied byte by byte.
+    Where there was a CHECKSUM, there is again.  The file is read back before it gets its name.
+    """
+    if form not in INTO_FORMS:
+        raise ValueError(f"format must be one of {', '.join(INTO_FORMS)}, got {form!r}")
+    if alternates not in ("keep", "remove"):
+        raise ValueError(f"alternates must be 'keep' or 'remove', got {alternates!r}")
+    path, extension = split_extension(image)
+    # Behind a symbolic link the file is replaced, not the link.
+    path = Path(os.path.realpath(path))
+    target = path if output is None else Path(output)
+    check_output(target, overwrite=overwrite or output is None)
+    if file_kind(path) != "fits":
+        raise FileFormatError(f"{path}: must be a FITS image")
+    if output is None and not os.access(path, os.W_OK):
+        raise InputError(f"{path}: image must be writable, is not; a copy can be written instead")
+    with _named(image):
+        parts = _read_parts(path)
+        number = _choose(parts, extension, path)
+        obj = _fit_shape(obj, parts[number].header, image)
+        gone = tables_of(parts[number].header)
+        for other, part in enumerate(parts):
+            if other != number:
+                gone -= tables_of(part.header)
+    kept = [part for part in parts if part.name not in gone]
+    versions = {}
+    for part in kept:
+        name, version = part.name
+        versions[name] = max(versions.get(name, 1), version + 1)
+    versions["WPDC_LUT"] = max(versions.get(n, 1) for n in ("WPDC_LUT", "WPDC_INSTRUMENT"))
+    made = make_form(obj, form, degree=degree, versions=versions)
+    warn_if_far(made, image)
+    letters, with_sip = alternates_of(parts[number].header)
+    gone_letters = letters if alternates == "remove" else with_sip
+    with atomic_path(target, overwrite=overwrite or output is None) as temporary:
+        with open_stream(path) as source, open_stream(temporary, "wb", like=path) as copy:
+            for part in kept:
+                if part is parts[number]:
+                    _copy_target(source, copy, part, made, gone_letters, image)
+                else:
+                    _copy_bytes(source, copy, part.start, part.end)
+                if part is kept[-1]:
+                    copy.write(_table_bytes(made.tables, parts[number].header))
+            _copy_bytes(source, copy, parts[-1].end, None)
+        if output is None:
+            shutil.copymode(path, temporary)
+        with _named(image):
+            _check(obj, made, temporary, kept.index(parts[number]), image)
+    if alternates == "keep" and with_sip:
+        warnings.warn(
+            f"{image}: alternate WCS {', '.join(sorted(with_sip))} removed: it used the SIP terms "
+            "of the old WCS",
+            WPDCWarning,
+        )
+    return made
+
+
+@contextlib.contextmanager
+def _named(image):
+    """Say whose headers they are that astropy does not understand."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield
+        except InputError:
+            raise
+        except READ_ERRORS as problem:
+            raise FileFormatError(f"{image}: damaged header: {first_line(problem)}") from problem
+
+
+def _read_parts(path):
+    with open_fits(path):
+        # That it is complete.
+        pass
+    parts = []
+    with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
+        for hdu in hdus:
+            info = hdu.fileinfo()
+            start, data = info["hdrLoc"], info["datLoc"]
+            name = (hdu.name.upper(), hdu.ver)
+            parts.append(_Part(hdu.header.copy(), start, data, data + info["datSpan"], name))
+    return parts
+
+
+def _is_image(header):
+    if header_value(header, "ZIMAGE") is True:
+        return header_value(header, "ZNAXIS") == 2
+    is_table = str(header_value(header, "XTENSION") or "IMAGE").strip() != "IMAGE"
+    return not is_table and header_value(header, "NAXIS") == 2
+
+
+def _choose(parts, extension, path):
+    """Give the number of the image that is meant."""
+    with open_fits(path, lazy=True) as hdus:
+        names = extension_names(hdus)
+        number = None if extension is None else find_extension(hdus, extension, path)
+    images = [k for k, part in enumerate(parts) if _is_image(part.header)]
+    own = [k for k in images if not parts[k].name[0].startswith(("WCSDVARR", "D2IMARR"))]
+    if number is None:
+        if len(own) != 1:
+            raise InputError(
+                f"{path}: has {len(own)} images of two axes; choose one with path[EXT], "
+                f"EXT one of {names}"
+            )
+        return own[0]
+    if number not in images:
+        raise InputError(f"{path}[{extension}]: must be an image of two axes")
+    return number
+
+
+def _fit_shape(obj, header, image):
+    shape, known = header_shape(header), image_shape_of(obj)
+    if known is None:
+        solution = dataclasses.replace(getattr(obj, "solution", obj), image_shape=shape)
+        return dataclasses.replace(obj, solution=solution) if obj is not solution else solution
+    if tuple(known) != tuple(shape):
+        raise InputError(
+            f"{image}: must have the shape of the detector, {known[1]} x {known[0]} px, "
+            f"has {shape[1]} x {shape[0]}"
+        )
+    return obj
+
+
+def _copy_bytes(source, copy, start, end):
+    source.seek(start)
+    left = np.inf if end is None else end - start
+    while left > 0 and (chunk := source.read(int(min(_CHUNK, left)))):
+        copy.write(chunk)
+        left -= len(chunk)
+    if end is not None and left:
+        # Padding that was left out at the end of the file.
+        copy.write(b"\0" * int(left))
+
+
+def _copy_target(source, copy, part, made, letters, image):
+    source.seek(part.start)
+    text = source.read(part.data - part.start).decode("latin-1")
+    cards = [text[i : i + 80] for i in range(0, len(text), 80)]
+    end = next((i for i, card in enumerate(cards) if card.rstrip() == "END"), None)
+    if end is None:
+        raise FileFormatError(f"{image}: damaged header: must have an END card, has none")
+    cards, place = _without_stale(cards[:end], letters)
+    own = [card.image for card in made.header.cards]
+    if made.form == "fits":
+        own.append(fits.Card("WPDCVERS", FORMAT_VERSION, "format version of wpdc_gwcs").image)
+    own = [line[i : i + 80] for line in own for i in range(0, len(line), 80)]
+    cards[place:place] = own
+    if made.tables and part.start == 0 and not any(c.startswith("EXTEND  =") for c in cards):
+        after = max(i for i, c in enumerate(cards) if c.startswith("NAXIS"))
+        cards.insert(after + 1, fits.Card("EXTEND", True, "there may be extensions").image)
+    cards.append(fits.Card("HISTORY", _history(made)).image)
+    header = _pad([*cards, "END".ljust(80)])
+    checksum = next((i for i, c in enumerate(cards) if c.startswith("CHECKSUM=")), None)
+    if checksum is not None:
+        cards[checksum] = _checksum_card(cards[checksum], "0" * 16)
+        total = sum_words(_pad([*cards, "END".ljust(80)]))
+        total = sum_words(b"", total + _data_sum(source, part))
+        cards[checksum] = _checksum_card(cards[checksum], checksum_text(total))
+        header = _pad([*cards, "END".ljust(80)])
+    copy.write(header)
+    _copy_bytes(source, copy, part.data, part.end)
+
+
+def _without_stale(cards, letters):
+    """Leave out stale cards; the rest, and where the first of them stood."""
+    left, place, following = [], None, False
+    for card in cards:
+        # What goes on in CONTINUE cards goes with them; so does the checksum of a header that
+        # tile compression replaced.
+        stale = following if card.startswith("CONTINUE") else is_stale(card, letters)
+        stale = stale or card.startswith("ZHECKSUM=")
+        following = stale
+        if not stale:
+            left.append(card)
+        elif place is None and card[8:9] == "=":
+            place = len(left)
+    if place is None:
+        place = len(left)
+        while place and not left[place - 1].strip():
+            place -= 1
+    return left, place
+
+
+def _pad(cards):
+    data = "".join(cards).encode("latin-1")
+    return data.ljust(-(-len(data) // _BLOCK) * _BLOCK)
+
+
+def _checksum_card(card, value):
+    return f"CHECKSUM= '{value}'{card[28:]}"[:80].ljust(80)
+
+
+def _data_sum(source, part):
+    """Give the sum of the data: as stated, so that damage stays visible, or counted."""
+    stated = header_value(part.header, "DATASUM")
+    if stated is not None and str(stated).strip().isdigit():
+        return int(stated)
+    source.seek(part.data)
+    total, left = 0, part.end - part.data
+    while left > 0 and (chunk := source.read(min(_CHUNK, left))):
+        left -= len(chunk)
+        total = sum_words(chunk.ljust(-(-len(chunk) // 4) * 4, b"\0"), total)
+    return total
+
+
+def _history(made):
+    worst = made.keywords_deviation if made.form == "fits" else made.deviation
+    text = f"WCS by wpdc_gwcs {__version__.split('+')[0]} as {made.form}"
+    return f"{text}, good to {worst:.2g} px"[:72]
+
+
+def _table_bytes(tables, header):
+    """Give the bytes of extensions, with checksums where the image has them."""
+    if not tables:
+        return b""
+    file = io.BytesIO()
+    hdus = fits.HDUList([fits.PrimaryHDU(), *(table.copy() for table in tables)])
+    hdus.writeto(file, checksum="CHECKSUM" in header)
+    return file.getvalue()[_BLOCK:]
+
+
+def _check(obj, made, path, number, image):
+    """Read the file back: nothing of the old WCS may have a say in it."""
+    with open_fits(path) as hdus:
+        header = hdus[number].header.copy()
+        tables = [] if made.form == "fits" else [hdu.copy() for hdu in hdus[1:]]
+    found = deviation(obj, astropy_sky(header, tables))
+    expected = made.keywords_deviation if made.form == "fits" else made.deviation
+    if not found <= _READ_BACK * expected + _ROUNDING_PX:
+        raise FileFormatError(
+            f"{image}: other cards of the header have a say in the WCS: it would deviate by "
+            f"{found:.3g} px instead of {expected:.3g} px"
+        )

@@ -1,0 +1,116 @@
+"""Which cards of a header belong to its WCS, and which extensions they refer to."""
+
+import re
+
+from astropy.io import fits
+
+from wpdc_gwcs.export import INSTRUMENT_NAME, TABLE_NAME
+from wpdc_gwcs.io.headers import header_text, header_value
+
+__all__ = ["alternates_of", "is_stale", "tables_of"]
+
+# Keywords of a WCS that may have the letter of an alternate behind them.
+_ANY = (
+    r"WCSAXES|WCSNAME|LONPOLE|LATPOLE|RADESYS|EQUINOX|"
+    r"(?:CTYPE|CUNIT|CRVAL|CRPIX|CDELT|CROTA|CNAME|CRDER|CSYER)\d+|"
+    r"(?:CD|PC|PV|PS)\d+_\d+|"
+    r"(?:CPDIS|CQDIS|CPERR|CQERR|DP|DQ)\d+|DVERR"
+)
+_ALTERNATE = re.compile(rf"(?:{_ANY})([A-Z])")
+_PRIMARY = re.compile(
+    rf"{_ANY}|"
+    # Spellings before the standard.
+    r"RADECSYS|LONGPOLE|(?:PC|CD)00\d00\d|PROJP\d+|"
+    # SIP; look-up tables of astropy's for the detector.
+    r"[AB]P?_ORDER|[AB]P?_\d+_\d+|[AB]P?_DMAX|D2IM(?:DIS|ERR)?\d+|D2IMEXT|AXISCORR|"
+    # Plate solutions of the Digitized Sky Survey and of SuperCOSMOS; TNX and ZPX of IRAF.
+    r"AMD[XY]\d+|PPO\d+|CO[12]_\d+|PLTRA[HMS]|PLTDEC(?:SN|[DMS])|PLTSCALE|CNPIX[12]|[XY]PIXELSZ|"
+    r"WAT\d_\d+|WCSDIM|"
+    # What this package writes.
+    r"WPDC(?:VERS|TAB|DEV)"
+)
+_HISTORY = "WCS by wpdc_gwcs"
+
+
+def is_stale(card, alternates):
+    """Tell whether a card goes when another primary WCS comes.
+
+    Parameters
+    ----------
+    card : str
+        The card, 80 characters.
+    alternates : collection of str
+        Letters of the alternates that go, too.
+
+    Returns
+    -------
+    stale : bool
+        Whether it does.
+    """
+    keyword = card[:8].rstrip()
+    if keyword == "HISTORY":
+        return card[8:].startswith(_HISTORY)
+    if card[8:9] != "=":
+        return False
+    if _PRIMARY.fullmatch(keyword):
+        return True
+    match = _ALTERNATE.fullmatch(keyword)
+    return match is not None and match[1] in alternates
+
+
+def alternates_of(header):
+    """Give the letters of the alternate WCSs of a header, and of those that use SIP terms.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        The header.
+
+    Returns
+    -------
+    letters, with_sip : set of str
+        All of them; those that mean nothing without the SIP terms of the primary WCS.
+    """
+    letters = {m[1] for key in header if (m := _ALTERNATE.fullmatch(key)) is not None}
+    with_sip = {
+        letter
+        for letter in letters
+        if any(header_text(header, f"CTYPE{i}{letter}").endswith("-SIP") for i in (1, 2))
+    }
+    return letters, with_sip
+
+
+def tables_of(header):
+    """Give the extensions that the primary WCS of a header refers to.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        The header.
+
+    Returns
+    -------
+    tables : set of (str, int)
+        EXTNAME and EXTVER.
+    """
+    found = set()
+    for axis in range(1, 10):
+        for kind, record, name in (
+            ("CPDIS", "DP", "WCSDVARR"),
+            ("CQDIS", "DQ", "WCSDVARR"),
+            ("D2IMDIS", "D2IM", "D2IMARR"),
+        ):
+            if header_text(header, f"{kind}{axis}").lower() == "lookup":
+                found.add((name, _version(header, f"{record}{axis}.EXTVER")))
+        if header_text(header, f"CTYPE{axis}").endswith("-TAB"):
+            name = header_text(header, f"PS{axis}_0").upper()
+            found.add((name, _version(header, f"PV{axis}_1")))
+    if header_text(header, "WPDCVERS"):
+        version = _version(header, "WPDCTAB")
+        found |= {(TABLE_NAME, version), (INSTRUMENT_NAME, version)}
+    return found
+
+
+def _version(header: fits.Header, key):
+    value = header_value(header, key)
+    return int(value) if isinstance(value, int | float) else 1
