@@ -497,13 +497,15 @@ def test_signals_end_all_processes_quietly(inputs, tmp_path, number, to_all):
     runs = check_sets(out)
     slow = tmp_path / "slow.py"
     slow.write_text(
-        "import time, wpdc_gwcs.calibration.workers as workers\n"
+        "import signal, time, wpdc_gwcs.calibration.workers as workers\n"
         "true = workers.measure_sources\n"
         "def slowly(*args):\n"
         "    time.sleep(60)\n"
         "    return true(*args)\n"
         "workers.measure_sources = slowly\n"
         "if __name__ == '__main__':\n"
+        # A shell that runs the tests in the background has it ignored.
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "    from wpdc_gwcs.__main__ import main\n"
         "    main()\n"
     )

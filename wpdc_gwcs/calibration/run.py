@@ -90,8 +90,8 @@ def calibrate(
     catalog : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
         Reference catalogue: whatever `read_catalog` takes, and what it returned.
     solution : DistortionSolution, Camera or mapping, optional
-        Stored solution (of a camera, or detector name to solution): only the attitudes of the
-        frames are fitted.
+        Stored solution (of a camera, or detector name to solution): its distortion is kept; each
+        frame gets its attitude, and a field where its stars speak for one.
     update : bool, optional
         Merge the new frames into the stored solution, and let it follow a change, instead of
         keeping it fixed.

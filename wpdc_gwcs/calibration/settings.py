@@ -26,15 +26,16 @@ class Settings:
     Parameters
     ----------
     weight : str, optional
-        Radial weight of the polynomial fit: ``exp-sqrt`` (the paper's), ``gaussian``, ``inverse``,
-        ``inverse-square`` or ``uniform``.
+        Radial weight of the polynomial, the table has the rest: ``exp-sqrt`` (the paper's),
+        ``gaussian``, ``inverse``, ``inverse-square`` or ``uniform``.
     r0 : float, optional
-        Radius in px within which all stars weigh the same; `None` is 0.87 times half the shorter
-        side.
+        Radius in px within which the polynomial follows the distortion; `None` is 0.87 times half
+        the shorter side.
     n_grid : int, optional
         Nodes of the look-up table along each axis.
     lut : {'auto', 'none'}, optional
-        ``auto`` keeps a table where it lowers the cross-validated residual.
+        A table of what the polynomial leaves (``auto``; mean residuals are part of it where they
+        predict left-out ones), or the polynomial alone (``none``).
     refine : {'auto', 'attitude', 'field', 'pv'}, optional
         What an exposure has of its own: six linear numbers (``attitude``), also a smooth field
         where its evidence is there (``auto``) or in any case (``field``), or a polynomial

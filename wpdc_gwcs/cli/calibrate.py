@@ -95,8 +95,8 @@ def calibrate_command(
         list[Path] | None,
         typer.Option(
             metavar="FILE",
-            help="Stored *.solution.asdf (once for each detector) or *.camera.asdf: fit only the "
-            "attitude of each frame.",
+            help="Stored *.solution.asdf (once for each detector) or *.camera.asdf: keep the "
+            "distortion; each frame gets its attitude, and a field where its stars speak for one.",
         ),
     ] = None,
     update: Annotated[
@@ -125,21 +125,25 @@ def calibrate_command(
     lut: Annotated[
         str,
         typer.Option(
-            metavar="{auto,none}", help="Look-up table: where it helps (auto), or never (none)."
+            metavar="{auto,none}",
+            help="Look-up table of what the polynomial leaves (auto), or the polynomial alone "
+            "(none).",
         ),
     ] = "auto",
     weight: Annotated[
         str,
         typer.Option(
             metavar="NAME",
-            help="Radial weight: exp-sqrt, gaussian, inverse, inverse-square or uniform.",
+            help="Radial weight of the polynomial, the table has the rest: exp-sqrt, gaussian, "
+            "inverse, inverse-square or uniform.",
         ),
     ] = "exp-sqrt",
     r0: Annotated[
         float | None,
         typer.Option(
             metavar="PX",
-            help="Radius of full weight in px; default: 0.87 x half the shorter side.",
+            help="Radius in px within which the polynomial follows the distortion; default: "
+            "0.87 x half the shorter side.",
         ),
     ] = None,
     n_grid: Annotated[
