@@ -7,7 +7,7 @@ The TPV headers of BASS (``wcs_headers/legacysurvey/90prime`` under WPDC_GWCS_DA
 point, as 90Prime's four chips stand about theirs, and is the truth: stars are drawn on the chip and
 taken to the sky by ``astropy.wcs``, their positions measured with errors of 0.02 to 0.1 px (8 to 45
 mas), and ``calibrate`` starts from the header with its pointing off by 3 arcsec.  The reference
-point becomes the source nearest to the chip's centre (``reference_point="nearest-source"``).
+point becomes the source nearest to the chip's center (``reference_point="nearest-source"``).
 
 Printed are the standard deviations of RA and Dec of the calibrated WCS against the header, in mas,
 on a grid over the chip: cubic alone with the weight exp-sqrt, and with a look-up table; the limits
@@ -50,7 +50,7 @@ def chip_of(path):
 
 
 def simulate(tan, n_exposures, n_stars, rng):
-    """Frames and the reference catalogue; the truth of each frame is an `astropy.wcs.WCS`."""
+    """Frames and the reference catalog; the truth of each frame is an `astropy.wcs.WCS`."""
     from dataclasses import replace
 
     from astropy.table import QTable, vstack

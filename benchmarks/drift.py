@@ -27,7 +27,7 @@ import numpy as np
 from solution import find_lab, simulate, solve
 
 SIZE = 0.05
-QUARTERS = ("corner", "strip", "centre", "band")
+QUARTERS = ("corner", "strip", "center", "band")
 SHAPES = ("constant", "gradient", "bump", "ripple")
 
 
@@ -40,7 +40,7 @@ def change(x, y, half, *, quarter, turn, shape, angle):
         inside, s, t = (a > 0) & (b > 0), 2 * a - 1, 2 * b - 1
     elif quarter == "strip":
         inside, s, t = a > 0.5, 4 * a - 3, b
-    elif quarter == "centre":
+    elif quarter == "center":
         inside, s, t = np.maximum(abs(a), abs(b)) < 0.5, 2 * a, 2 * b
     else:
         inside, s, t = abs(a - 0.25) < 0.25, 4 * a - 1, b

@@ -7,9 +7,9 @@ polynomial of degree 2 to 6, long waves with tangential decentering, or an arcta
 fisheye), 20 to 200 px at the worst corner but at most 8 % of local scale, on detectors from 128 x
 4000 to 9216 x 9232 px of 0.05 to 1 arcsec per px, anywhere on the sky, every fifth frame at a pole,
 at any roll.  The header is a plain TAN, right at the center but for some arcsec, 0.1 deg and 0.2 %.
-"stars" are the stars that source list and catalogue have in common, measured with errors of 0.01 to
-0.1 px; a fifth as many sources are spurious, a fifth of the catalogue's stars on the detector have
-no source, and the catalogue goes on beyond the detector.  In the layouts half, edge, band and
+"stars" are the stars that source list and catalog have in common, measured with errors of 0.01 to
+0.1 px; a fifth as many sources are spurious, a fifth of the catalog's stars on the detector have
+no source, and the catalog goes on beyond the detector.  In the layouts half, edge, band and
 corner it ends at the border of that part of the detector, and with it the common stars.
 
 Errors are those of the delivered WCS on a grid of 41 x 41 over the whole detector, in undistorted
@@ -100,7 +100,7 @@ KINDS = (radial, polynomial, waves, fisheye)
 
 
 class Field:
-    """The truth of one frame, its source list and its catalogue."""
+    """The truth of one frame, its source list and its catalog."""
 
     def __init__(self, seed, stars, layout="all", *, errors=True):
         rng = np.random.default_rng([seed, stars, LAYOUTS.index(layout)])
@@ -171,7 +171,7 @@ class Field:
         self.covered = covered
 
     def _draw_places(self, rng, n, reach=1.0, *, beside=0.0):
-        """Places of the catalogue's part up to ``reach`` detectors, none up to ``beside``."""
+        """Places of the catalog's part up to ``reach`` detectors, none up to ``beside``."""
         x, y = np.empty((2, 0))
         while x.size < n:
             t = rng.uniform(-reach, reach, (2, 8 * n))
@@ -201,7 +201,7 @@ class Field:
              "ref_epoch": np.full(x.size, EPOCH)},
             units={"ra": "deg", "dec": "deg", "ra_error": "mas", "dec_error": "mas"},
         )[order]  # fmt: skip
-        self.row = np.argsort(order)[:n]  # of the common stars in the catalogue
+        self.row = np.argsort(order)[:n]  # of the common stars in the catalog
 
         mag = np.append(mag[:n], draw_magnitudes(rng, spurious))
         sigma = 0.01 * 10 ** (mag / 5)

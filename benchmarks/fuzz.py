@@ -201,7 +201,7 @@ def odd_image(path, rng):
 
 
 def odd_table(path, rng):
-    """Catalogues with values that are none."""
+    """Catalogs with values that are none."""
     table = Table.read(path)
     name = str(rng.choice(table.colnames))
     odd = [np.nan, np.inf, -1e308, 1e5, 0.0, -91.0][int(rng.integers(6))]

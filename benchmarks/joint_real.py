@@ -6,14 +6,14 @@ Four WIRCam frames of one sensor (``wircam`` in DIR, WPDC_GWCS_DATA or ../shared
 2011 to 2017, with Gaia DR2.  Each image is measured once, then everything starts from its list of
 sources; with --cache the lists are kept as ECSV.
 
-First part: a fifth of the catalogue is held out, another one in each split, and the frames are
+First part: a fifth of the catalog is held out, another one in each split, and the frames are
 solved together and each alone.  "joint" and "alone" are the scatters (1.4826 MAD, root mean square
 of both axes) of the held-out stars that both have paired, all splits together.  Pulls are those of
 the brightest fifth of them by S/N: residual over centroid error and ``calibration.uncertainty``.
 
 Second part: of one frame only 60 (25) stars are left, drawn from those that the solution of all
 frames has used, and it is solved with the three other frames and alone.  The frame and its stars
-are moved by 90 deg in RA, a rotation of the sky, so that its catalogue has these stars only: it is
+are moved by 90 deg in RA, a rotation of the sky, so that its catalog has these stars only: it is
 the solution that is tested, not the match.  Compared are the stars with centroid errors below 8 mas
 that were not drawn, as the full solution has paired them; "full" is their scatter in that solution,
 which has used them.  At the end each requirement, and whether it is met.
@@ -80,7 +80,7 @@ def solve(frames, catalog, **options):
 
 
 def residuals(calibration, x, y, ra, dec):
-    """Catalogue minus position on the sky, (2, N) mas."""
+    """Catalog minus position on the sky, (2, N) mas."""
     found_ra, found_dec = calibration.wcs(x, y)
     d_ra = (np.asarray(ra) - found_ra + 180) % 360 - 180
     return 3.6e6 * np.array([d_ra * np.cos(np.radians(dec)), np.asarray(dec) - found_dec])
@@ -176,7 +176,7 @@ def report_splits(found):
 
 
 def aside(frame, gaia):
-    """The frame and the catalogue moved to another part of the sky."""
+    """The frame and the catalog moved to another part of the sky."""
     wcs, moved = frame.wcs.deepcopy(), gaia.copy()
     for value in (wcs.wcs.crval[:1], moved["ra"]):
         value[:] = (value + ASIDE) % 360

@@ -60,7 +60,7 @@ def locate(variable, name):
 
 
 class Camera:
-    """Smooth distortion of degree 2 to 6 about the centre of the frame, exact and invertible."""
+    """Smooth distortion of degree 2 to 6 about the center of the frame, exact and invertible."""
 
     def __init__(self, rng, shape, corner):
         self.shape = shape
@@ -298,7 +298,7 @@ def report_impossible(n, first, max_stars):
 
 
 def spoil_few(seed):
-    """Few-star frame of `few_stars.py` whose sources have nothing to do with its catalogue."""
+    """Few-star frame of `few_stars.py` whose sources have nothing to do with its catalog."""
     from few_stars import LAYOUTS, Field
 
     rng = np.random.default_rng([seed, 2])

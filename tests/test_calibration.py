@@ -159,12 +159,12 @@ def test_a_frame_that_fails_leaves_the_others_alone(simulation, catalog):
 def test_catalogue_of_another_part_of_the_sky(simulation, catalog):
     elsewhere = catalog.copy()
     elsewhere["ra"] = np.asarray(elsewhere["ra"]) + 10
-    with pytest.raises(MatchError, match=r"no star within 0\.\d+ deg of the frame's centre"):
+    with pytest.raises(MatchError, match=r"no star within 0\.\d+ deg of the frame's center"):
         match_frame(simulation.exposures[0].frame(), elsewhere)
 
 
 def test_stars_without_motion_do_not_spoil_the_solution():
-    """12 years after the catalogue, all stars have moved by 120 mas on the mean."""
+    """12 years after the catalog, all stars have moved by 120 mas on the mean."""
     sky = simulate(2, image_shape=SHAPE, density=25, distortion=15, seed=5, epoch=2028.0)
     reference = read_catalog(sky.reference)
     for name, bulk in (("ra", 8.0), ("dec", -6.0)):

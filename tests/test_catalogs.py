@@ -1,4 +1,4 @@
-"""Reference catalogues: names, units, epochs, and motion against astropy."""
+"""Reference catalogs: names, units, epochs, and motion against astropy."""
 
 import contextlib
 import gzip
@@ -167,7 +167,7 @@ def test_color_from_two_bands(bands):
     table[bands[0]] = MaskedColumn([15.5, 16.0, 17.0], mask=[False, True, False])
     table[bands[1]] = [14.0, 15.0, 15.0]
     np.testing.assert_array_equal(read_catalog(table)["bp_rp"], [1.5, np.nan, 2.0])
-    # A color of the catalogue's own comes first, star by star.
+    # A color of the catalog's own comes first, star by star.
     table["bp_rp"] = [1.25, 0.5, np.nan]
     np.testing.assert_array_equal(read_catalog(table)["bp_rp"], [1.25, 0.5, 2.0])
     table.remove_columns(["bp_rp", bands[0]])
@@ -257,7 +257,7 @@ def write_text(path, text):
 
 class TestBadInput:
     def test_missing(self, tmp_path):
-        with pytest.raises(CatalogError, match=r"no.fits: catalogue must be an existing file"):
+        with pytest.raises(CatalogError, match=r"no.fits: catalog must be an existing file"):
             read_catalog(tmp_path / "no.fits")
 
     def test_empty(self, tmp_path):
@@ -291,7 +291,7 @@ class TestBadInput:
 
     def test_no_rows(self, tmp_path):
         stars()[:0].write(tmp_path / "a.fits")
-        with pytest.raises(CatalogError, match=r"a.fits: catalogue must have rows, has 0"):
+        with pytest.raises(CatalogError, match=r"a.fits: catalog must have rows, has 0"):
             read_catalog(tmp_path / "a.fits")
 
     def test_no_positions(self):
@@ -605,7 +605,7 @@ def test_errors_of_filled_motions_without_columns_of_errors():
         assert np.isnan(sigma[~lacking]).all()
         assert np.median(sigma[lacking]) == pytest.approx(SPREAD * YEARS, rel=0.1)
         assert moved[name].unit == u.mas
-    # At the epoch of the catalogue there is nothing to add.
+    # At the epoch of the catalog there is nothing to add.
     assert np.isnan(propagate(read_catalog(table), 2016.0)["ra_error"]).all()
 
 
@@ -677,7 +677,7 @@ def test_stars_move_towards_the_sun_by_their_parallax(epoch):
     sun = SkyCoord(sun.ra, sun.dec)  # aberration and the Sun's own way are within a degree
     shift = before.separation(after).to_value(u.mas)
     angle = before.separation(sun)
-    # The distance of the Sun is within 1.7 % of an au, that of the barycentre within 0.8 % of it.
+    # The distance of the Sun is within 1.7 % of an au, that of the barycenter within 0.8 % of it.
     np.testing.assert_allclose(shift, 100.0 * np.sin(angle), rtol=0.03)
     turn = before.position_angle(after) - before.position_angle(sun)
     assert np.abs(turn.wrap_at(180 * u.deg)).max() < 2 * u.deg

@@ -127,7 +127,7 @@ def test_faint_stars_near_the_cramer_rao_bound(frame):
         x, y, flux = (frame[c][k : k + 1] for c in ("x", "y", "flux"))
         corner = np.floor([x[0] - 12, y[0] - 12])
         shape = (25, 25)
-        # the varying part of the PSF is small: taken at the centre
+        # the varying part of the PSF is small: taken at the center
         left, right = (stars_image(shape, x - corner[0] + d, y - corner[1], flux) for d in (-h, h))
         model = stars_image(shape, x - corner[0], y - corner[1], flux)
         variance = RMS**2 + (model + 50) / GAIN
@@ -175,7 +175,7 @@ def test_photutils_agrees(frame):
     np.testing.assert_allclose(ours["flux"], theirs["flux_fit"], rtol=0.03)
 
 
-def test_neighbours_are_taken_off(rng):
+def test_neighbors_are_taken_off(rng):
     x, y = star_grid(rng, 30)
     flux = np.full(x.size, 20000.0)
     angle = rng.uniform(0, 2 * np.pi, x.size)

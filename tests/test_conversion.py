@@ -81,7 +81,7 @@ def test_stock_gwcs(crval):
 def test_gwcs_of_other_models_and_frame():
     """A pipeline as telescopes have it: degree 5, galactic, a box narrower than the image."""
     rng = np.random.default_rng(2)
-    centred = Shift(-250.0) & Shift(-200.0)
+    centered = Shift(-250.0) & Shift(-200.0)
     terms = {
         f"c{i}_{j}": rng.normal() * 250.0 ** (1 - i - j) * 0.02
         for i in range(6)
@@ -90,7 +90,7 @@ def test_gwcs_of_other_models_and_frame():
     }
     sky = to_stock_wcs(camera_wcs((200.0, 10.0), table=None)).pipeline[1].transform
     model = (
-        centred
+        centered
         | (
             Mapping((0, 1, 0, 1))
             | Polynomial2D(5, c1_0=1.0, **terms) & Polynomial2D(5, c0_1=1.0, **terms)

@@ -33,7 +33,7 @@ def gaussian_stars(shape, x, y, flux, sigma):
 
 
 def star_grid(rng, step=30, margin=20):
-    """One star per cell, at random pixel phases; nobody near the edge or a neighbour."""
+    """One star per cell, at random pixel phases; nobody near the edge or a neighbor."""
     gy, gx = np.mgrid[margin : SHAPE[0] - margin : step, margin : SHAPE[1] - margin : step]
     return gx.ravel() + rng.uniform(-3, 3, gx.size), gy.ravel() + rng.uniform(-3, 3, gx.size)
 

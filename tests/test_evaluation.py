@@ -216,7 +216,7 @@ def without_linear(table):
         lambda u, v: np.maximum(abs(u), abs(v)) < 0.5,
         lambda u, v: abs(v - 0.25) < 0.25,
     ],
-    ids=["corner", "strip", "centre", "band"],
+    ids=["corner", "strip", "center", "band"],
 )
 def test_what_the_attitudes_took_of_a_change_is_given_back(part):
     """A quarter changes by 0.05 px, and each frame has its linear part in its attitude."""

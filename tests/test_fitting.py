@@ -100,7 +100,7 @@ class TestWPDCFitter:
         assert fitter.fit_info["n_used"] == 2000
 
     def test_weighted_least_squares(self, rng):
-        """Against lstsq of the same weighted objective, in normalised coordinates."""
+        """Against lstsq of the same weighted objective, in normalized coordinates."""
         xi, eta = field(rng)
         ref = np.array([xi, eta]) + rng.normal(size=(2, 2000)) * SCALE
         ref[0] += 1e3 * eta**4

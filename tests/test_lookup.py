@@ -162,7 +162,7 @@ class TestNumerics:
             ("gaussian", 6.0, 1),
         ],
     )  # fmt: skip
-    def test_generalised_cross_validation(self, rng, kernel, epsilon, least):
+    def test_generalized_cross_validation(self, rng, kernel, epsilon, least):
         bins = Bins(make_map(rng, 400).coarsen(4))
         m = len(bins)
         spectrum = Spectrum(bins, kernel, epsilon, least)
@@ -250,7 +250,7 @@ class TestBuildLookupTable:
         maps = [make_map(rng, 1500, fold=0) for _ in range(4)]
         table, info = build_lookup_table(maps, 20)
         assert np.sqrt(np.mean(table_error(table) ** 2)) < 0.02
-        # One exposure alone: generalised cross-validation.
+        # One exposure alone: generalized cross-validation.
         alone, _ = build_lookup_table(make_map(rng, 6000, fold=0), 20)
         assert np.sqrt(np.mean(table_error(alone) ** 2)) < 0.02
 

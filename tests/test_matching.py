@@ -441,7 +441,7 @@ def test_a_lattice_of_little_jitter_is_never_silently_wrong(seed):
 
 
 def make_copies(rng, *, angle=0.0, share=1.0):
-    """A catalogue with every star (or a share of them) twice, the second one shifted and turned."""
+    """A catalog with every star (or a share of them) twice, the second one shifted and turned."""
     stars = rng.uniform(-300, 2348, (900, 2))
     c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
     copies = (stars - 1024) @ np.array([[c, s], [-s, c]]) + 1024 + [137.0, -81.0]

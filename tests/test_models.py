@@ -316,7 +316,7 @@ def test_tangent_plane_is_that_of_wcslib(crval, rng):
     assert_allclose(project(ra, dec, crval), (xi, eta), rtol=0, atol=2e-13)
 
 
-def test_north_pole_has_the_orientation_of_its_neighbourhood():
+def test_north_pole_has_the_orientation_of_its_neighborhood():
     # FITS turns a header by half a circle at exactly +90 deg (default LONPOLE); the models do not.
     at_pole, beside = deproject(0.3, 0.4, (20.0, 90.0)), deproject(0.3, 0.4, (20.0, 90.0 - 1e-9))
     assert_allclose(at_pole, beside, rtol=0, atol=1e-6)
@@ -416,9 +416,9 @@ def test_inverse_at_the_rim_and_outside(rng):
     for push in (-2e-9, 0.0, 2e-9):
         found = np.array(distortion.inverse(*(np.array(distortion(*rim)) + push)))
         assert_allclose(found, rim, rtol=0, atol=1e-8)
-    centre = np.array([[511.5], [511.5]])
+    center = np.array([[511.5], [511.5]])
     for stretch in (1.001, 1.05, 1.5, 4.0):
-        outside = centre + (rim - centre) * stretch
+        outside = center + (rim - center) * stretch
         assert_allclose(distortion.inverse(*distortion(*outside)), outside, rtol=0, atol=1e-7)
     assert np.all(np.isnan(distortion.inverse([np.inf, np.nan], [0.0, 5.0])))
 

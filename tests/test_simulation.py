@@ -41,7 +41,7 @@ def test_greatest_displacement_is_the_amplitude():
 
 def test_centre_stays():
     distortion = Distortion.random((800, 1000), amplitude=25.0, rng=4)
-    x0, y0 = distortion.centre
+    x0, y0 = distortion.center
     np.testing.assert_allclose(distortion.undistort(x0, y0), (x0, y0), atol=1e-9)
     # The linear part of the radial term is in the linear WCS.  The polynomial has none.
     h = 1e-3

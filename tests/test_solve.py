@@ -613,18 +613,18 @@ def test_wircam_sensor(shared_data, sensor, table, cubic_only):
     rows = rows[np.asarray(rows["qq"]) == sensor]
     x, y = np.asarray(rows["xmeas"], float) - 1, np.asarray(rows["ymeas"], float) - 1
     ra, dec = np.asarray(rows["ra"], float), np.asarray(rows["dec"], float)
-    centre = np.array([np.median(ra), np.median(dec)])
+    center = np.array([np.median(ra), np.median(dec)])
     # A straight line through the pairs, robustly, is all the starting WCS there is.
     columns, kept = (
         np.stack([np.ones_like(x), x - 1023.5, y - 1023.5], axis=1),
         np.ones(len(x), bool),
     )
-    plane = np.array(project(ra, dec, centre)).T
+    plane = np.array(project(ra, dec, center)).T
     for _ in range(10):
         linear = np.linalg.lstsq(columns[kept], plane[kept], rcond=None)[0]
         residual = np.hypot(*(plane - columns @ linear).T)
         kept = residual < 5 * np.median(residual)
-    start = deproject(*linear[0], centre), linear[1:].T
+    start = deproject(*linear[0], center), linear[1:].T
 
     def scatter(lut, split):
         use = np.random.default_rng(split).uniform(size=len(x)) > 0.2

@@ -64,7 +64,7 @@ def fit_wcs(wcs, *, image_shape=None, detector="detector", frame="converted"):
 
     Notes
     -----
-    The tangent point is the sky at the centre of the image, or that of the WCS itself where it is a
+    The tangent point is the sky at the center of the image, or that of the WCS itself where it is a
     tangential one of astropy.  The lowest degree up to 3 that is enough alone needs no table;
     otherwise a cubic has one, of 50 x 50 nodes or more as needed.  Positions are taken to ICRS.
     Where a bounding box is narrower than the image, the WCS is used beyond it.
@@ -149,7 +149,7 @@ def _plane(sky, pixels, crval):
     if bad.any():
         x, y = pixels[:, np.argmax(bad)]
         raise ValueError(
-            "wcs must have a value everywhere on the image, within 90 deg of its centre; it has "
+            "wcs must have a value everywhere on the image, within 90 deg of its center; it has "
             f"none at x {x:.1f}, y {y:.1f}"
         )
     return plane
@@ -181,7 +181,7 @@ def _reference(wcs, sky, shape):
         crpix = 0.5 * (np.array(shape[::-1]) - 1.0)
         crval = np.array(sky(*crpix[:, np.newaxis]), float)[:, 0]
     if not np.isfinite(crval).all():
-        raise ValueError("wcs must have a value at the centre of the image, has none")
+        raise ValueError("wcs must have a value at the center of the image, has none")
     return crpix, crval
 
 

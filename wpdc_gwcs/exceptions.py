@@ -42,7 +42,7 @@ class DuplicateFrameError(FrameError, ValueError):
 
 
 class CatalogError(InputError):
-    """A reference catalogue that cannot be read or lacks what is needed."""
+    """A reference catalog that cannot be read or lacks what is needed."""
 
 
 class FileFormatError(InputError):
@@ -58,7 +58,7 @@ class DetectionError(FrameFailure):
 
 
 class MatchError(FrameFailure):
-    """The sources could not be matched to the reference catalogue with sufficient evidence."""
+    """The sources could not be matched to the reference catalog with sufficient evidence."""
 
 
 class FitError(FrameFailure):

@@ -13,7 +13,7 @@ __all__ = [
 
 FLAG_SATURATED = 1  # a pixel of the core is at the saturation level
 FLAG_EDGE = 2  # the core reaches over the edge of the image
-FLAG_BLENDED = 4  # a neighbour disturbs the core
+FLAG_BLENDED = 4  # a neighbor disturbs the core
 FLAG_COSMIC = 8  # sharper than the PSF: cosmic ray or hot pixel
 FLAG_EXTENDED = 16  # broader than the PSF: galaxy, or an unresolved blend
 FLAG_BAD_PIXEL = 32  # a masked pixel within the core

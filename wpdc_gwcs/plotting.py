@@ -18,7 +18,7 @@ __all__ = [
     "plot_weights",
 ]
 
-# Okabe and Ito's colours, told apart with any colour vision.
+# Okabe and Ito's colors, told apart with any color vision.
 _BLUE, _ORANGE, _GREY = "#0072B2", "#D55E00", "#999999"
 _OTHERS = ("#009E73", "#CC79A7", "#000000")
 _DIVERGING, _SEQUENTIAL = "RdBu_r", "viridis"
@@ -105,7 +105,7 @@ def plot_residuals_vs_position(matches):
     Returns
     -------
     `matplotlib.figure.Figure`
-        Four panels.  Stars of the fit and held-out stars have their own colours, stars that are
+        Four panels.  Stars of the fit and held-out stars have their own colors, stars that are
         neither (clipped) are grey; the line is the running median of the first two and the band
         holds the middle 68 % of them.
     """

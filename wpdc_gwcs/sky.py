@@ -87,12 +87,12 @@ def move(ra, dec, pmra, pmdec, years):
 
 
 def annual_parallax(ra, dec, parallax, epoch):
-    """Shift stars by their annual parallax as seen from the Earth's centre.
+    """Shift stars by their annual parallax as seen from the Earth's center.
 
     Parameters
     ----------
     ra, dec : (N,) ndarray
-        Positions seen from the barycentre, deg.
+        Positions seen from the barycenter, deg.
     parallax : (N,) ndarray
         Parallaxes, mas.
     epoch : float

@@ -323,7 +323,7 @@ def sky_map(wcs, *, image_shape=None, out=None):
     Returns
     -------
     ra, dec : (ny, nx) ndarray
-        Coordinates of the pixel centres in degrees; views of ``out`` where it was given.
+        Coordinates of the pixel centers in degrees; views of ``out`` where it was given.
 
     Raises
     ------
@@ -478,8 +478,8 @@ def _pair(first, second):
 def _stock_distortion(distortion):
     polynomial, radial = distortion.expand()
     crpix = distortion.crpix.value
-    centred = Shift(-crpix[0]) & Shift(-crpix[1])
-    model = centred | _pair(*map(_polynomial2d, polynomial))
+    centered = Shift(-crpix[0]) & Shift(-crpix[1])
+    model = centered | _pair(*map(_polynomial2d, polynomial))
     if radial is not None:
         matrix = distortion.cd.value
         metric = matrix.T @ matrix
@@ -490,7 +490,7 @@ def _stock_distortion(distortion):
             radius | Polynomial1D(len(row) - 1, **{f"c{s}": value for s, value in enumerate(row)})
             for row in radial
         )
-        model = model + (centred | _pair(*in_radius))
+        model = model + (centered | _pair(*in_radius))
     table = distortion.lookup_table
     if table is None:
         return model

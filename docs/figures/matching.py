@@ -25,13 +25,13 @@ from wpdc_gwcs.matching import MatchOptions, match_planes, pair_nearest, select_
 from wpdc_gwcs.matching._features import (
     N_NEIGHBOURS,
     density_ratio_map,
-    neighbour_pattern,
+    neighbor_pattern,
 )
 from wpdc_gwcs.matching._growth import fit_pairs, grow_locally, grow_once
-from wpdc_gwcs.matching._hypotheses import count_neighbours, find_groups, first_pairs
+from wpdc_gwcs.matching._hypotheses import count_neighbors, find_groups, first_pairs
 from wpdc_gwcs.matching._problem import Stars, prepare_problem
 
-# Okabe and Ito's colours, told apart with any colour vision.
+# Okabe and Ito's colors, told apart with any color vision.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
 SHIFT, TURN = np.array([9.0, 12.0]) / 3600, 1.0  # deg
 N_ANCHORS = 49
@@ -75,7 +75,7 @@ class Stages:
         )
         self.sources = Stars.build(self.problem.sources)
         self.reference = self.problem.stars
-        self.n_near = count_neighbours(self.problem, self.sources, self.reference, N_NEIGHBOURS)
+        self.n_near = count_neighbors(self.problem, self.sources, self.reference, N_NEIGHBOURS)
         self.hypotheses, self.groups = find_groups(
             self.problem, self.sources, self.reference, None, N_ANCHORS, N_NEIGHBOURS, 10**8
         )
@@ -154,7 +154,7 @@ def draw_density(stages):
 
 
 def draw_features(stages):
-    """One star, its right and a wrong candidate, and how their neighbours differ."""
+    """One star, its right and a wrong candidate, and how their neighbors differ."""
     problem = stages.problem
     h = stages.hypotheses
     right_ones = np.flatnonzero(stages.is_right(h.source, h.reference))
@@ -172,15 +172,15 @@ def draw_features(stages):
     for panel, (title, stars, row, color) in zip(panels[0], lists, strict=True):
         x, y = stars.points[row]
         n = stages.n_near[stars is stages.reference]
-        log_d, angle, neighbour = neighbour_pattern(stars.tree, [row], n)
+        log_d, angle, neighbor = neighbor_pattern(stars.tree, [row], n)
         patterns.append((log_d[0], angle[0]))
         panel.plot(*stars.points.T, ".", ms=4, color=GREY)
-        for other in stars.points[neighbour[0]]:
+        for other in stars.points[neighbor[0]]:
             panel.plot([x, other[0]], [y, other[1]], "-", lw=1, color=color)
-        panel.plot(*stars.points[neighbour[0]].T, "o", ms=6, color=color)
+        panel.plot(*stars.points[neighbor[0]].T, "o", ms=6, color=color)
         panel.plot(x, y, "*", ms=17, color=color, mec="k")
         panel.set(xlim=(x - 100, x + 100), ylim=(y - 100, y + 100), aspect="equal", xlabel="x (px)")
-        panel.set_title(f"{title}, {n} neighbours")
+        panel.set_title(f"{title}, {n} neighbors")
     panels[0, 0].set_ylabel("y (px)")
     panel = panels[1, 0]
     for (log_d, angle), (title, _, _, color), marker in zip(
@@ -394,7 +394,7 @@ PICTURES = {
 
 
 def save(figure, path):
-    """Write a small PNG: 256 colours are plenty for lines, points and one colour scale."""
+    """Write a small PNG: 256 colors are plenty for lines, points and one color scale."""
     full = io.BytesIO()
     figure.savefig(full, dpi=90)
     few = (
@@ -410,7 +410,7 @@ def main():
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("frame", help="image with a header of the right sky")
-    parser.add_argument("catalog", help="reference catalogue")
+    parser.add_argument("catalog", help="reference catalog")
     parser.add_argument("folder", type=Path, help="where the pictures go")
     parser.add_argument("--only", nargs="+", choices=PICTURES, default=PICTURES)
     a = parser.parse_args()

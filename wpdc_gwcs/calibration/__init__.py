@@ -1,4 +1,4 @@
-"""The chain from frames and a catalogue to calibrated WCS: the only module that knows every stage.
+"""The chain from frames and a catalog to calibrated WCS: the only module that knows every stage.
 
 ::
 

@@ -92,7 +92,7 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
     settings : Settings
         Choices.
     holdout : (n_catalog,) array_like of bool, optional
-        Reference stars, by their row in the catalogue, that are kept out of every fit.
+        Reference stars, by their row in the catalog, that are kept out of every fit.
     solution : dict, optional
         Stored solutions by detector.
     update : bool, optional

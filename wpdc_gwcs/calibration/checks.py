@@ -178,10 +178,10 @@ def _few_detections(frame, match):
     if match.n_pairs < _MIN_DETECTED * min(detected, match.n_reference):
         return [
             f"{match.n_pairs} of {detected} detections match, {detected - match.n_sources} are "
-            f"left out (flagged, not round or faint); the catalogue has {match.n_reference} stars "
+            f"left out (flagged, not round or faint); the catalog has {match.n_reference} stars "
             "on the frame"
         ]
-    # A shallow catalogue has the bright stars: of the faint ones nobody knows.
+    # A shallow catalog has the bright stars: of the faint ones nobody knows.
     clean = np.flatnonzero(frame.usable)
     if "flux" not in sources.colnames or len(clean) <= match.n_reference:
         return []
@@ -192,7 +192,7 @@ def _few_detections(frame, match):
         return []
     return [
         f"{matched} of the {len(bright)} brightest of {match.n_sources} clean detections match; "
-        "the catalogue has as many stars on the frame"
+        "the catalog has as many stars on the frame"
     ]
 
 

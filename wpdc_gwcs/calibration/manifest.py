@@ -34,7 +34,7 @@ class Manifest:
     created : str
         When it began, UTC.
     software, settings, catalog, solution, update : dict, str, bool
-        Versions, options, and sums over the reference catalogue and the stored solutions.
+        Versions, options, and sums over the reference catalog and the stored solutions.
     inputs : list of dict
         Path, size and time of each input file.
     frames : dict
@@ -180,7 +180,7 @@ def plan_run(run_id, groups, *, settings, catalog, catalog_path, solution, updat
     settings : Settings
         Choices.
     catalog : `~astropy.table.Table`
-        Reference catalogue as read.
+        Reference catalog as read.
     catalog_path : path-like or None
         Its file, if it came from one.
     solution : DistortionSolution, mapping or None

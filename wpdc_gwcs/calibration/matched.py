@@ -1,4 +1,4 @@
-"""One frame, matched to the reference catalogue."""
+"""One frame, matched to the reference catalog."""
 
 import logging
 import time
@@ -78,14 +78,14 @@ class FailedFrame:
 
 
 def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
-    """Measure one frame and match it to the reference catalogue.
+    """Measure one frame and match it to the reference catalog.
 
     Parameters
     ----------
     frame : Frame
         Image or source list.
     catalog : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
-        Reference catalogue: what `read_catalog` takes, or has returned.
+        Reference catalog: what `read_catalog` takes, or has returned.
     settings : Settings, optional
         Choices; the defaults work for any camera.
     sources : `~astropy.table.Table`, optional
@@ -221,14 +221,14 @@ def _reach(frame, start, settings):
 
 
 def catalog_of_frame(frame, catalog, settings, *, solution=None):
-    """Cut the reference catalogue to what a frame can need, to be handed to another process.
+    """Cut the reference catalog to what a frame can need, to be handed to another process.
 
     Parameters
     ----------
     frame : Frame
         Its WCS tells where.
     catalog : `~astropy.table.Table`
-        Reference catalogue whose motions have been filled.
+        Reference catalog whose motions have been filled.
     settings : Settings
         A blind search needs more.
     solution : DistortionSolution, optional
@@ -237,7 +237,7 @@ def catalog_of_frame(frame, catalog, settings, *, solution=None):
     Returns
     -------
     `~astropy.table.Table`
-        Rows of the catalogue, from which `match_frame` selects the same stars as from all.
+        Rows of the catalog, from which `match_frame` selects the same stars as from all.
     """
     return select_cone(catalog, *_reach(frame, _start(frame, solution), settings))
 
@@ -250,7 +250,7 @@ def reference_in_reach(frame, catalog, start, settings):
     frame : Frame
         Its WCS tells where.
     catalog : `~astropy.table.Table`
-        Reference catalogue.
+        Reference catalog.
     start : LinearWCS
         Its scale counts.
     settings : Settings
@@ -259,7 +259,7 @@ def reference_in_reach(frame, catalog, start, settings):
     Returns
     -------
     `~astropy.table.Table`
-        Rows of the catalogue.
+        Rows of the catalog.
 
     Raises
     ------
@@ -267,13 +267,13 @@ def reference_in_reach(frame, catalog, start, settings):
         If there are none.
     """
     ra, dec, radius = _reach(frame, start, settings)
-    # Before the cut, which would take neighbours away; in a run it has been done for all frames.
+    # Before the cut, which would take neighbors away; in a run it has been done for all frames.
     near = select_cone(fill_motions(catalog), ra, dec, radius)
     if settings.max_mag is not None and "phot_g_mean_mag" in near.colnames:
         near = near[~(np.asarray(near["phot_g_mean_mag"], float) > settings.max_mag)]
     if len(near) == 0:
         raise MatchError(
-            f"{frame.source}: the catalogue has no star within {radius:.3f} deg of the frame's "
-            f"centre, RA {ra:.4f} Dec {dec:.4f} deg"
+            f"{frame.source}: the catalog has no star within {radius:.3f} deg of the frame's "
+            f"center, RA {ra:.4f} Dec {dec:.4f} deg"
         )
     return near if frame.epoch is None else propagate(near, frame.epoch, parallax=True)

@@ -70,7 +70,7 @@ def start_from_neighbors(frames, results, catalog, settings=None, *, solution=No
     results : dict
         Frame name to `MatchedFrame` or `FailedFrame`.
     catalog : `~astropy.table.Table`
-        Reference catalogue as returned by `read_catalog`.
+        Reference catalog as returned by `read_catalog`.
     settings : Settings, optional
         Choices of the run.
     solution : DistortionSolution or mapping, optional

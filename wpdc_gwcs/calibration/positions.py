@@ -36,7 +36,7 @@ def sky_positions(calibration, x, y, x_err, y_err):
     -------
     positions : dict of str to (N,) ndarray
         ``ra``, ``dec`` in deg; ``ra_error`` (times cos Dec) and ``dec_error`` in mas, and their
-        correlation ``ra_dec_corr``: of centroid and calibration together, as in Gaia's catalogues.
+        correlation ``ra_dec_corr``: of centroid and calibration together, as in Gaia's catalogs.
         Errors are NaN where those of the centroid or of the calibration are unknown.
 
     Notes

@@ -81,14 +81,14 @@ def calibrate(
     resume=False,
     progress=None,
 ):
-    """Calibrate frames against a reference catalogue.
+    """Calibrate frames against a reference catalog.
 
     Parameters
     ----------
     frames : Frame or iterable of Frame
         What `wpdc_gwcs.io.read_frames` returns; names must be unique.
     catalog : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
-        Reference catalogue: whatever `read_catalog` takes, and what it returned.
+        Reference catalog: whatever `read_catalog` takes, and what it returned.
     solution : DistortionSolution, Camera or mapping, optional
         Stored solution (of a camera, or detector name to solution): its distortion is kept; each
         frame gets its attitude, and a field where its stars speak for one.
@@ -102,14 +102,14 @@ def calibrate(
     executor : concurrent.futures.Executor, optional
         Where frames are measured and matched instead, for example
         ``dask.distributed.Client(...).get_executor()``.  With each frame goes the part of the
-        catalogue that it can need, and no more.
+        catalog that it can need, and no more.
     output : path-like, optional
         Folder into which all results are written, made if needed; those of a detector as soon as
         it is solved.
     overwrite : bool, optional
         Replace files that are there.
     resume : bool, optional
-        Leave out what a run of the same frames, catalogue, settings and versions has written into
+        Leave out what a run of the same frames, catalog, settings and versions has written into
         the folder already, and go on with it.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` while the run goes on.
@@ -126,7 +126,7 @@ def calibrate(
     ValueError
         If there is no frame.
     InputError
-        If the catalogue cannot be used, a file cannot be written or may not be replaced, or a run
+        If the catalog cannot be used, a file cannot be written or may not be replaced, or a run
         of other choices is to be resumed.
 
     Warns
@@ -151,7 +151,7 @@ def calibrate(
     folder = None if output is None else ResultFolder(output, overwrite=overwrite, resume=resume)
     with folder or nullcontext():
         path = catalog if isinstance(catalog, str | os.PathLike) else None
-        # Before the catalogue, which may take a while.
+        # Before the catalog, which may take a while.
         if folder is not None:
             folder.check(groups, inputs=[] if path is None else [split_extension(path)[0]])
         catalog = read_catalog(catalog)
@@ -167,7 +167,7 @@ def calibrate(
                 update=update,
             )
             run_id = folder.begin(groups, plan).run
-        # Once and from the whole catalogue: a star moves alike in all frames.
+        # Once and from the whole catalog: a star moves alike in all frames.
         run = _Run(frames, fill_motions(catalog), solution, settings, update, progress)
         done = [group for group in groups if folder is not None and folder.is_done(group)]
         outcomes = {group[0].name: folder.load(group) for group in done}
@@ -412,7 +412,7 @@ def _match_group(group, results, run, workers):
 
 
 def _holdout_mask(catalog, settings):
-    """Rows of the catalogue that are kept out of every fit, the same in all frames."""
+    """Rows of the catalog that are kept out of every fit, the same in all frames."""
     if settings.holdout == 0:
         return None
     size = int(np.max(catalog["catalog_index"])) + 1

@@ -47,7 +47,7 @@ class Settings:
         How positions are measured on images; source lists are always taken as given.
     reference_point : {'header', 'center', 'nearest-source'}, optional
         Where the tangent point and the polynomial's origin are.  A header's point that lies off
-        the detector is replaced by the centre.
+        the detector is replaced by the center.
     threshold : float, optional
         Detection threshold in standard deviations of the background.
     min_snr : float, optional

@@ -94,7 +94,7 @@ def sky_of(wcs, x, y):
 
 
 def detector_center(image_shape):
-    """Centre of a detector.
+    """Center of a detector.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def detector_center(image_shape):
 
 
 def header_reference_point(frame):
-    """Find the reference point of the header, or the centre where it is not on the detector.
+    """Find the reference point of the header, or the center where it is not on the detector.
 
     Parameters
     ----------

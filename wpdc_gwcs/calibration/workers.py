@@ -55,7 +55,7 @@ class Task:
     sources: Table | None = None
 
     def alone(self):
-        """Task that carries no more of the catalogue than it needs.
+        """Task that carries no more of the catalog than it needs.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Reference catalogues: read, check, move to the epoch of a frame, cut to the sky it covers.
+"""Reference catalogs: read, check, move to the epoch of a frame, cut to the sky it covers.
 
 ::
 
@@ -6,7 +6,7 @@
                                                   --select_cone--> near the frame
                                                   --propagate--> at the epoch of the frame
 
-Motions are filled from the whole catalogue, before the cut, so that a star moves alike in all
+Motions are filled from the whole catalog, before the cut, so that a star moves alike in all
 frames.
 
 The checked table has plain float64 columns with fixed names and units, whatever the input called

@@ -1,4 +1,4 @@
-"""The part of a catalogue about a place on the sky."""
+"""The part of a catalog about a place on the sky."""
 
 import numpy as np
 
@@ -6,14 +6,14 @@ __all__ = ["select_cone"]
 
 
 def select_cone(catalog, ra, dec, radius):
-    """Select the part of a catalogue within a radius of a position.
+    """Select the part of a catalog within a radius of a position.
 
     Parameters
     ----------
     catalog : `~astropy.table.Table`
         As returned by `read_catalog`.
     ra, dec : float
-        Centre, deg.
+        Center, deg.
     radius : float
         Radius, deg; the rim belongs to the cone.
 
@@ -32,7 +32,7 @@ def select_cone(catalog, ra, dec, radius):
     """
     if not (np.isfinite([ra, dec, radius]).all() and radius >= 0):
         raise ValueError(
-            "the cone needs a finite centre and a radius >= 0, "
+            "the cone needs a finite center and a radius >= 0, "
             f"got ra={ra}, dec={dec}, radius={radius}"
         )
     all_dec = np.asarray(catalog["dec"], float)

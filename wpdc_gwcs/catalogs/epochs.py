@@ -1,4 +1,4 @@
-"""Reference epochs of catalogues: columns, metadata, the release that is named."""
+"""Reference epochs of catalogs: columns, metadata, the release that is named."""
 
 import re
 import warnings
@@ -18,7 +18,7 @@ _GAIA_EPOCHS = (
     (re.compile(r"gaia\s*[-_/]?\s*dr1|I[/_]337", re.IGNORECASE), 2015.0),
 )
 _ASSUMED_EPOCH = 2016.0
-# Positions on photographic plates are older than any reference catalogue of use.
+# Positions on photographic plates are older than any reference catalog of use.
 _EPOCH_RANGE = (1800.0, 2200.0)
 
 
@@ -80,7 +80,7 @@ def _julian_years(table, column, name):
     known = values[np.isfinite(values)]
     if known.size == 0:
         return None
-    # Julian dates and modified ones occur (Pan-STARRS); no catalogue is from before the year 1000.
+    # Julian dates and modified ones occur (Pan-STARRS); no catalog is from before the year 1000.
     if known.min() > 2.3e6:
         values = 2000.0 + (values - 2451545.0) / 365.25
     elif known.min() > 10000.0:

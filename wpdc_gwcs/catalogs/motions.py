@@ -14,23 +14,23 @@ __all__ = ["fill_motions", "propagate"]
 # about their scatter, hence nothing about the error of a star that is moved by them.
 _NEIGHBORS = 30
 _LEAST_NEIGHBORS = 5
-# Stars whose neighbours are looked up at once: some 30 MB.
+# Stars whose neighbors are looked up at once: some 30 MB.
 _BLOCK = 20000
 
 
 def fill_motions(catalog):
-    r"""Give stars without a known proper motion that of their neighbours.
+    r"""Give stars without a known proper motion that of their neighbors.
 
     Parameters
     ----------
     catalog : `~astropy.table.Table`
-        As returned by `read_catalog`; all of it, because a part has other neighbours.
+        As returned by `read_catalog`; all of it, because a part has other neighbors.
 
     Returns
     -------
     catalog : `~astropy.table.Table`
         A copy with ``pmra``, ``pmdec``, ``pmra_error`` and ``pmdec_error`` filled in where the
-        motion was not known, and the boolean column ``pm_from_neighbors``.  The catalogue itself
+        motion was not known, and the boolean column ``pm_from_neighbors``.  The catalog itself
         where there is nothing to fill, where it has been filled, or where fewer than five stars
         have a motion.
 
@@ -84,7 +84,7 @@ def fill_motions(catalog):
 
 
 def propagate(catalog, epoch, *, parallax=False):
-    r"""Move a catalogue to another epoch.
+    r"""Move a catalog to another epoch.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def propagate(catalog, epoch, *, parallax=False):
     epoch : float or `~astropy.time.Time`
         Julian year (TCB and TDB need not be told apart here).
     parallax : bool, optional
-        Add the annual parallax as seen from the Earth's centre, so that the positions are
+        Add the annual parallax as seen from the Earth's center, so that the positions are
         *apparent* directions rather than barycentric ones.  Off by default; a calibration uses it.
 
     Returns
@@ -101,12 +101,12 @@ def propagate(catalog, epoch, *, parallax=False):
     catalog : `~astropy.table.Table`
         A copy with ``ra``, ``dec``, ``pmra``, ``pmdec`` and ``ref_epoch`` at the new epoch,
         position errors grown by the errors of the proper motion, and ``ra_pmra_corr`` and
-        ``dec_pmdec_corr`` with them.  Stars without proper motion move with their neighbours (see
+        ``dec_pmdec_corr`` with them.  Stars without proper motion move with their neighbors (see
         `fill_motions`); where too few stars have one, and without an epoch, they stay put.
 
     Notes
     -----
-    Linear motion in space on unit vectors (The Hipparcos and Tycho Catalogues, ESA SP-1200, vol. 1,
+    Linear motion in space on unit vectors (The Hipparcos and Tycho Catalogs, ESA SP-1200, vol. 1,
     sect. 1.5.5), with the radial velocity taken as zero:
 
     .. math::
@@ -119,9 +119,9 @@ def propagate(catalog, epoch, *, parallax=False):
     .. math::
         \sigma^2(t) = \sigma^2 + 2 \rho\,\sigma\,\sigma_\mu t + \sigma_\mu^2 t^2
 
-    with the correlation :math:`\rho` of position and motion, zero where the catalogue gives none.
+    with the correlation :math:`\rho` of position and motion, zero where the catalog gives none.
     An error that is not known counts as zero; columns of position errors are made where the
-    catalogue has only those of the motions.  ``ra_dec_corr`` is left as it is.
+    catalog has only those of the motions.  ``ra_dec_corr`` is left as it is.
 
     Of a parallax :math:`\varpi` with the error :math:`\sigma_\varpi` is used
 

@@ -1,4 +1,4 @@
-"""Positions of a catalogue: columns, units, impossible rows, old reference systems."""
+"""Positions of a catalog: columns, units, impossible rows, old reference systems."""
 
 import logging
 import re
@@ -40,7 +40,7 @@ _POSITIONS = (
 )
 # Columns that are radians where they have no unit: the tables of the Rubin pipelines.
 _RADIANS = ("coord_ra",)
-# Stars per square degree that no catalogue has: taken for degrees, these positions are in another
+# Stars per square degree that no catalog has: taken for degrees, these positions are in another
 # unit.  The lower one decides where the name of the column speaks for radians already.
 _TOO_DENSE, _DENSE = 1e7, 1e5
 # Rows without which a density says nothing.
@@ -112,7 +112,7 @@ def read_positions(table, pair, name):
     finite = np.isfinite(ra) & np.isfinite(dec)
     if not finite.any():
         raise CatalogError(
-            f"{name}: catalogue must have rows with finite {pair[0]!r} and {pair[1]!r}, "
+            f"{name}: catalog must have rows with finite {pair[0]!r} and {pair[1]!r}, "
             f"none of {len(table)} has"
         )
     keep = finite.copy()
@@ -150,7 +150,7 @@ def read_positions(table, pair, name):
         rounding = float(step * 3.6e6 / np.sqrt(12))
         warnings.warn(
             f"{name}: positions are in single precision, which rounds them by up to "
-            f"{step * 1.8e6:.2g} mas: a catalogue in double precision gives a better solution",
+            f"{step * 1.8e6:.2g} mas: a catalog in double precision gives a better solution",
             WPDCWarning,
         )
     return {"ra": ra % 360.0, "dec": dec}, keep, rounding
@@ -242,8 +242,7 @@ def turn_to_icrs(columns, keep, meta, name):
         return
     if {"pmra", "pmdec"} & set(columns):
         raise CatalogError(
-            f"{name}: catalogue must be in ICRS or FK5 to have proper motions, is in "
-            f"{system.upper()}"
+            f"{name}: catalog must be in ICRS or FK5 to have proper motions, is in {system.upper()}"
         )
     sky = SkyCoord(columns["ra"][keep], columns["dec"][keep], unit="deg", frame=system).icrs
     columns["ra"][keep], columns["dec"][keep] = sky.ra.deg, sky.dec.deg

@@ -1,4 +1,4 @@
-"""Reading of a reference catalogue: from any table to the checked one."""
+"""Reading of a reference catalog: from any table to the checked one."""
 
 import logging
 import re
@@ -68,13 +68,13 @@ _MARK = "wpdc_catalog"
 
 
 def read_catalog(source, *, format=None):
-    """Read a reference catalogue and bring it to one form.
+    """Read a reference catalog and bring it to one form.
 
     Parameters
     ----------
     source : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
         A file in any format that astropy reads as a table (FITS, ECSV, CSV, VOTable, ...), a
-        FITS_LDAC catalogue, ``path[EXT]`` for one table of a FITS file, or what is already in
+        FITS_LDAC catalog, ``path[EXT]`` for one table of a FITS file, or what is already in
         memory.  Columns may have Gaia, VizieR or SExtractor names in any case.
     format : str, optional
         Format name for `astropy.table.Table.read` where the file name does not tell.
@@ -139,9 +139,9 @@ def _read_table(path, format):
     path, extension = split_extension(path)
     try:
         if not path.exists():
-            raise CatalogError(f"{path}: catalogue must be an existing file, found nothing there")
+            raise CatalogError(f"{path}: catalog must be an existing file, found nothing there")
         if path.is_file() and path.stat().st_size == 0:
-            raise CatalogError(f"{path}: catalogue must not be empty, the file has 0 bytes")
+            raise CatalogError(f"{path}: catalog must not be empty, the file has 0 bytes")
         # The readers warn of odd units and headers; what matters of that is checked afterwards.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -190,7 +190,7 @@ def _table_of_coordinates(coordinates):
 def _standardize(table, name):
     """Build the checked table; `name` is what messages call the input."""
     if len(table) == 0:
-        raise CatalogError(f"{name}: catalogue must have rows, has 0")
+        raise CatalogError(f"{name}: catalog must have rows, has 0")
     spelled = spelled_names(table.colnames)
     pair = find_positions(spelled)
     if pair is None:
@@ -241,7 +241,7 @@ def _positions_of_coordinates(table, name):
     found = next((c for c in table.colnames if isinstance(table[c], SkyCoord)), None)
     if found is None:
         raise CatalogError(
-            f"{name}: catalogue must have columns 'ra' and 'dec' (or RA_ICRS/DE_ICRS, "
+            f"{name}: catalog must have columns 'ra' and 'dec' (or RA_ICRS/DE_ICRS, "
             "X_WORLD/Y_WORLD, ALPHA_J2000/DELTA_J2000, RAJ2000/DEJ2000, ra_deg/dec_deg), "
             f"has {listed(table.colnames)}"
         )

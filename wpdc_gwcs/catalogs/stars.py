@@ -1,4 +1,4 @@
-"""The stars of a catalogue: one row for each."""
+"""The stars of a catalog: one row for each."""
 
 import warnings
 

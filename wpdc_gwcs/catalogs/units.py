@@ -1,4 +1,4 @@
-"""Units of the columns of a checked catalogue."""
+"""Units of the columns of a checked catalog."""
 
 from astropy import units as u
 from astropy.table import Column

@@ -64,7 +64,7 @@ def select_stars(stars, snr, quality, fwhm, shape, *, n_max, min_snr):
     if len(pairs):
         i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
         near = np.hypot(x[i] - x[j], y[i] - y[j]) / fwhm
-        # Tolerable neighbours are the fainter the nearer they are; what they leave is clipped.
+        # Tolerable neighbors are the fainter the nearer they are; what they leave is clipped.
         limit = 0.02 * np.maximum(near - 1, 0) ** 2
         candidate[i[flux[j] > limit * flux[i]]] = False
     rows = np.flatnonzero(candidate)
@@ -162,7 +162,7 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
     Returns
     -------
     profile : Profile
-        Profile, normalised and centred.
+        Profile, normalized and centered.
     stars : Stars
         Stars kept.
     noise : Noise

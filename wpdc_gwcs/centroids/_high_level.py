@@ -41,7 +41,7 @@ _MIN_STARS = 8
 _MAX_CHI2 = 4.0
 # Reduced chi square up to which the formal errors stand; beyond, they grow with its root.
 _TOLERATED_CHI2 = 1.5
-# Light of neighbours, in standard deviations of the sky, that does not matter to a fit.
+# Light of neighbors, in standard deviations of the sky, that does not matter to a fit.
 _NEGLIGIBLE = 0.05
 _CHUNK = 10_000
 # Error of the PSF, relative, below which a residual is no sign of another star.
@@ -195,9 +195,9 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3, refit
     error : float or (ny, nx) array_like, optional
         Standard deviation of the background; only for a plain array.
     passes : int, optional
-        Number of rounds; from the second on, the neighbours' models are subtracted.
+        Number of rounds; from the second on, the neighbors' models are subtracted.
     refit : bool, optional
-        The sources have been fitted before, or found beside such: neighbours are subtracted from
+        The sources have been fitted before, or found beside such: neighbors are subtracted from
         the first round on.  A source on the flank of a brighter one needs that.
 
     Returns
@@ -419,7 +419,7 @@ def _fitted_table(sources, fits, flags, fwhm, unit):
     error = np.sqrt(np.where(good[:, None], np.einsum("sii->si", fits.covariance), np.nan))
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = fits.stars.flux / error[:, 2]
-        # Beyond chance, a high chi square is an unseen neighbour or a PSF that does not fit.
+        # Beyond chance, a high chi square is an unseen neighbor or a PSF that does not fit.
         error *= np.sqrt(np.maximum(fits.chi2 / _TOLERATED_CHI2, 1))[:, None]
     columns = {
         "x": fits.stars.x,
@@ -471,7 +471,7 @@ def _field_of(data, error, saturation=None):
             raise ValueError("error must not be given: the Background has its own")
         if saturation is None:
             return Field(data.image, data.rms, data.mask, data.photons), data.unit
-        # The wings of a saturated star still tell its flux, which matters to its neighbours.
+        # The wings of a saturated star still tell its flux, which matters to its neighbors.
         full = data.data >= saturation
         mask = full if data.mask is None else full | data.mask
         return Field(data.image, data.rms, mask, data.photons), data.unit

@@ -60,7 +60,7 @@ class Profile:
     def _components(self):
         """Few grids of coefficients, and their shares (G, R) in those of all places.
 
-        Neighbouring places differ by a handful of shapes: with these, a star costs the same
+        Neighboring places differ by a handful of shapes: with these, a star costs the same
         however many places there are.
         """
         n = len(self.coefficients)
@@ -218,7 +218,7 @@ def moffat_samples(shape, half, oversampling):
     values = (1 + r2 * (2 ** (1 / beta) - 1) / width**2) ** -beta
     box = oversampling * fine
     for axis in (0, 1):
-        # An even number of points: the mean of both ways to centre the box.
+        # An even number of points: the mean of both ways to center the box.
         values = 0.5 * (
             uniform_filter1d(values, box, axis=axis)
             + uniform_filter1d(values, box, axis=axis, origin=-1)
@@ -230,7 +230,7 @@ def moffat_samples(shape, half, oversampling):
 
 
 def cutouts(image, xc, yc, half):
-    """Cut-outs (N, n) of 2 half + 1 px squares about integer centres, and where they are inside.
+    """Cut-outs (N, n) of 2 half + 1 px squares about integer centers, and where they are inside.
 
     Parameters
     ----------

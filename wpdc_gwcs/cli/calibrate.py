@@ -1,4 +1,4 @@
-"""`wpdc calibrate`: frames and a catalogue in, WCS files out."""
+"""`wpdc calibrate`: frames and a catalog in, WCS files out."""
 
 import logging
 import os
@@ -44,7 +44,7 @@ Catalog = Annotated[
     typer.Option(
         "--catalog",
         metavar="CAT",
-        help="Reference catalogue: FITS_LDAC, or any table astropy reads (Gaia column names).",
+        help="Reference catalog: FITS_LDAC, or any table astropy reads (Gaia column names).",
     ),
 ]
 WcsFile = Annotated[
@@ -157,7 +157,7 @@ def calibrate_command(
         str,
         typer.Option(
             metavar="{header,center,nearest-source}",
-            help="Tangent point and origin of the polynomial; the centre if off the detector.",
+            help="Tangent point and origin of the polynomial; the center if off the detector.",
         ),
     ] = "header",
     threshold: Threshold = 5.0,

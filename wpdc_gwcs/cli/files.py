@@ -18,7 +18,7 @@ CalibrationFile = Annotated[
 ]
 Origin = Annotated[
     int,
-    typer.Option(metavar="{0,1}", help="Pixel coordinate of the centre of the first pixel."),
+    typer.Option(metavar="{0,1}", help="Pixel coordinate of the center of the first pixel."),
 ]
 Output = Annotated[
     Path | None,

@@ -130,7 +130,7 @@ def match_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Match the sources of a frame to a catalogue; exit status 1 without enough evidence."""
+    """Match the sources of a frame to a catalog; exit status 1 without enough evidence."""
     import numpy as np
 
     from wpdc_gwcs.calibration import Settings, match_frame

@@ -4,7 +4,7 @@
 
     image --subtract_background--> Background --mask_hits--> Background
     Background --sep.extract--> peaks --sep.winpos--> x, y
-               --weighted moments, DAOFIND marginals, neighbours--> fwhm, roundness, flags
+               --weighted moments, DAOFIND marginals, neighbors--> fwhm, roundness, flags
 """
 
 from wpdc_gwcs.detection._background import Background, subtract_background

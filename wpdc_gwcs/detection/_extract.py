@@ -8,7 +8,7 @@ from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, cutouts, mode, sizes, wi
 __all__ = ["extract_peaks", "is_broad", "star_size", "typical_fwhm"]
 
 # Smoothing before the threshold: close to a matched filter for FWHM 1.5 to 3 px, and narrow enough
-# not to merge neighbours.
+# not to merge neighbors.
 _KERNEL = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]) / 16
 
 # Stars broader than this, FWHM in px, would fall to pieces under that kernel: the noise makes peaks

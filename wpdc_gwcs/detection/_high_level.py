@@ -24,7 +24,7 @@ __all__ = ["detect_companions", "detect_sources"]
 
 log = logging.getLogger(__name__)
 
-# A neighbour's light at the centre of a source, relative to the source's own, from which the fit
+# A neighbor's light at the center of a source, relative to the source's own, from which the fit
 # of both together is no longer as good as that of a single star.
 _MAX_SHARE = 0.15
 
@@ -156,7 +156,7 @@ def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_co
 
     Notes
     -----
-    A threshold finds no peak on the flank of a brighter star, and the light there moves the centre
+    A threshold finds no peak on the flank of a brighter star, and the light there moves the center
     of that star's fit.  What is nearer than 0.6 FWHM to a known source is not told from an error of
     the PSF and left alone.
 
@@ -233,7 +233,7 @@ def _measure(background, found, fwhm, gain, saturation):
 
 
 def _windowed(background, found, sigma, fwhm):
-    """Windowed centroids; the isophotal ones where the window ran away to a neighbour."""
+    """Windowed centroids; the isophotal ones where the window ran away to a neighbor."""
     x, y = found["x"].astype(float), found["y"].astype(float)
     xw, yw, _ = sep.winpos(
         background.image, found["xcpeak"], found["ycpeak"], sigma, mask=background.mask, subpix=5
@@ -276,7 +276,7 @@ def _unlike_stars(minor, size, snr, flags):
 
 
 def _blended(x, y, flux, fwhm):
-    """Mark sources whose core holds more than a few per cent of a neighbour's light."""
+    """Mark sources whose core holds more than a few per cent of a neighbor's light."""
     blended = np.zeros(len(x), bool)
     pairs = KDTree(np.column_stack([x, y])).query_pairs(4 * fwhm, output_type="ndarray")
     if len(pairs) == 0:

@@ -18,7 +18,7 @@ SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 
 
 def cutouts(image, xc, yc, half):
-    """Cut squares about integer centres; clamped at the edge of the image.
+    """Cut squares about integer centers; clamped at the edge of the image.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def daofind_shape(image, xpeak, ypeak, sigma):
 
 
 def mode(values):
-    """Most crowded value and its scatter: centre and width of the shortest third of the values.
+    """Most crowded value and its scatter: center and width of the shortest third of the values.
 
     Parameters
     ----------

@@ -303,7 +303,7 @@ class _Cells:
         return np.exp(-0.5 * np.sum(self.mean**2 / self.variance, axis=0))
 
     def place(self, n_grid):
-        """Centres of the cells from -1 to 1, as columns (1, u, v)."""
+        """Centers of the cells from -1 to 1, as columns (1, u, v)."""
         u, v = (2 * (i + 0.5) / n_grid - 1 for i in (self.index % n_grid, self.index // n_grid))
         return np.stack([np.ones_like(u), u, v], axis=1)
 
@@ -311,7 +311,7 @@ class _Cells:
 def _whole(solution, grids):
     """Probability of the chi-square of all cells together.
 
-    The errors of the table are common to neighbouring cells: they have no more independent values
+    The errors of the table are common to neighboring cells: they have no more independent values
     than the table has parameters, and the chi-square scatters the more.
     """
     cells = grids[_WHOLE_GRID]

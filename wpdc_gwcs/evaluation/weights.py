@@ -85,7 +85,7 @@ def compare_weights(calibrations, *, weights=RadialWeight.names, r0=None, degree
     -----
     The attitudes of the frames are kept, and a linear part that all of them share is free.  Tables
     are made as those of ``build_lookup_table(draft=True)``: one kernel, its smoothing by
-    generalised cross-validation.
+    generalized cross-validation.
 
     References
     ----------

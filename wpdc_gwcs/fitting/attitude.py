@@ -140,10 +140,10 @@ def fit_attitude(x, y, ra, dec, *, crpix, crval, cd, x_err=None, y_err=None, cli
         )
         plane = np.array(project(ra, dec, crval))
         residual = z - np.linalg.solve(cd, plane)
-        normalised = np.abs(residual) / sigma
-        scale = np.array([robust_sigma(a[kept]) for a in normalised])
+        normalized = np.abs(residual) / sigma
+        scale = np.array([robust_sigma(a[kept]) for a in normalized])
         limit = clip * np.maximum(scale, 1e-10)
-        keep = allowed & np.all(normalised <= limit[:, None], axis=0)
+        keep = allowed & np.all(normalized <= limit[:, None], axis=0)
         settled = np.array_equal(keep, kept)
         kept = (
             keep if iteration < _MAX_ITERATIONS // 2 else kept

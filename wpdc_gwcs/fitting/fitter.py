@@ -60,7 +60,7 @@ class WPDCFitter(Fitter):
 
     Notes
     -----
-    Minimises :math:`\sum w(r_i) \Delta_i^2 / \sigma_i^2` for each output, with ``weights`` =
+    Minimizes :math:`\sum w(r_i) \Delta_i^2 / \sigma_i^2` for each output, with ``weights`` =
     :math:`1/\sigma_i` as in astropy's fitters and :math:`w(r)` the radial weight (the paper's
     objective, equation 5, with its square put back).  The covariance is that of the estimate,
     :math:`M^{-1} A^T W V W A M^{-1}`, for weights that are not inverse variances; the variances are
@@ -119,7 +119,7 @@ class WPDCFitter(Fitter):
                     "pixel_scale must be a non-zero number or an invertible 2 x 2 matrix, got "
                     f"{pixel_scale}"
                 )
-        # The optimiser and statistic of the base class serve non-linear fits; there is none here.
+        # The optimizer and statistic of the base class serve non-linear fits; there is none here.
         self.weight = weight
         self.pixel_scale = pixel_scale
         self.robust = robust
@@ -295,24 +295,24 @@ class WPDCFitter(Fitter):
             residual = target - design @ parameters
             if self.robust is None:
                 break
-            normalised = np.abs(residual * inverse_sigma)
+            normalized = np.abs(residual * inverse_sigma)
             # The scale is that of the stars the fit answers for: outside r0 the polynomial is an
             # extrapolation.
             core = radial > 0.5 if np.sum(radial > 0.5) > free.sum() else radial > 0
             sigma = np.array(
-                [robust_sigma(a[core & (s > 0)]) for a, s in zip(normalised, inverse_sigma)]
+                [robust_sigma(a[core & (s > 0)]) for a, s in zip(normalized, inverse_sigma)]
             )
             limit = self.clip * np.maximum(sigma, np.finfo(float).tiny)[:, None]
             if self.robust == "clip":
                 keep = np.all(
-                    normalised <= np.maximum(limit, 1e-12 * np.abs(target * inverse_sigma).max()),
+                    normalized <= np.maximum(limit, 1e-12 * np.abs(target * inverse_sigma).max()),
                     axis=0,
                 )
                 converged = np.array_equal(keep, used)
                 used = keep
             else:
                 before = down
-                down = limit / np.maximum(normalised, limit)
+                down = limit / np.maximum(normalized, limit)
                 converged = np.max(np.abs(down - before), initial=0.0) < 1e-6
             if converged:
                 break

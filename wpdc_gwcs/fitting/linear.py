@@ -22,7 +22,7 @@ class LinearSolution(NamedTuple):
 
 
 def solve_linear(design, target, weight=None, *, leverage=False):
-    """Minimise ``sum(weight * (target - design @ p)**2)`` by QR and SVD of scaled columns.
+    """Minimize ``sum(weight * (target - design @ p)**2)`` by QR and SVD of scaled columns.
 
     Parameters
     ----------

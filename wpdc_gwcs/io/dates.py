@@ -109,7 +109,7 @@ def header_epoch(headers, *, name="header"):
     ``MJD-END``/``DATE-END``, then ``MJD-OBS``, ``DATE-OBS`` (with ``TIME-OBS``, ``UTC-OBS``, ``UT``
     where it has no time), ``MJD-BEG``, ``DATE-BEG``, ``MJD``, ``JD``, each plus half of
     ``EXPTIME``; then other keywords that are made of the same words, such as ``OBSMJD``,
-    ``EXPSTART``, ``SHUTOPEN`` or ``DATE_OBS``.  ``TIMESYS`` is honoured to the second, which is
+    ``EXPSTART``, ``SHUTOPEN`` or ``DATE_OBS``.  ``TIMESYS`` is honored to the second, which is
     1e-3 mas for any star.
     """
     problems = []

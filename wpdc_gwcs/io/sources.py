@@ -310,7 +310,7 @@ def standardize_sources(table, *, name="sources", origin=None):
     -----
     Errors of SExtractor are ellipses (``ERRAWIN_IMAGE``, ...); taken is their extent along x and y.
     ``ELONGATION`` e becomes a roundness 2 (e - 1) / (e + 1), which is DAOFIND's for a source
-    elongated along an axis.  Of SExtractor's ``FLAGS``, the lowest bit (a neighbour in the
+    elongated along an axis.  Of SExtractor's ``FLAGS``, the lowest bit (a neighbor in the
     aperture) says nothing of the centroid and is dropped.
     """
     names = list(getattr(table, "colnames", table))

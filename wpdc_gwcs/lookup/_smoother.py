@@ -37,7 +37,7 @@ class TableChoice:
     epsilon : float
         Shape parameter of the kernel in the same unit; 1 for kernels without a scale.
     score : float
-        Cross-validated mean square of the normalised residuals; NaN if not measured.
+        Cross-validated mean square of the normalized residuals; NaN if not measured.
     freedom : float
         Effective number of parameters per axis.
     """
@@ -51,7 +51,7 @@ class TableChoice:
 
 
 class Bins:
-    """Occupied bins in normalised coordinates: centroids, means, variances, second moments."""
+    """Occupied bins in normalized coordinates: centroids, means, variances, second moments."""
 
     def __init__(self, residual_map):
         total = residual_map.sums.sum(0)
@@ -135,9 +135,9 @@ def n_terms(degree):
 class Spectrum:
     """One kernel diagonalised on the bins: cross-validation for all smoothings and degrees.
 
-    With D = diag(sigma), the smoother minimises |D^-1 (d - f)|^2 + s |f|^2 in the kernel's norm.
+    With D = diag(sigma), the smoother minimizes |D^-1 (d - f)|^2 + s |f|^2 in the kernel's norm.
     In the space orthogonal to the polynomials of the kernel's least degree, D^-1 K D^-1 = U L U^T;
-    polynomials of higher degree are added by generalised least squares.
+    polynomials of higher degree are added by generalized least squares.
     """
 
     def __init__(self, bins, kernel, epsilon, least_degree):
@@ -171,7 +171,7 @@ class Spectrum:
         self._rotate = lambda matrix: rotate(matrix)[p:]
 
     def scores(self, value, smoothing, degrees):
-        """Generalised cross-validation and effective parameters, one row per degree."""
+        """Generalized cross-validation and effective parameters, one row per degree."""
         target = self._rotate(np.hstack([value * self._root[:, None], self._basis]))
         modes = self._vectors.T @ target
         # What no mode reaches is all residual.

@@ -38,10 +38,10 @@ NARROW_KERNELS = tuple(("gaussian", epsilon, 1) for epsilon in (3.0, 5.0, 6.0, 7
 # Smoothings tried, in units of the largest eigenvalue: from following every bin to all but none.
 _SMOOTHINGS = 10.0 ** np.arange(-10.0, 3.01, 0.5)
 
-# Gain of generalised cross-validation at which kernels of short length are tried.
+# Gain of generalized cross-validation at which kernels of short length are tried.
 _NARROW_GAIN = 0.998
 
-# Candidates that go from generalised cross-validation on to cross-validation over exposures.
+# Candidates that go from generalized cross-validation on to cross-validation over exposures.
 _N_SHORTLIST = 4
 
 # Stars per bin below which bins are joined further for the choice of settings.
@@ -122,7 +122,7 @@ def join_bins(residual_map):
 
 
 def _choose(coarse, *, allow_none):
-    """Kernel, degree and smoothing by generalised cross-validation, then by groups of exposures."""
+    """Kernel, degree and smoothing by generalized cross-validation, then by groups of exposures."""
     bins = Bins(coarse)
     quintic = Spectrum(bins, "quintic", 1.0, 2)
     pilot = pilot_surface(bins, first_choice(bins, quintic))
@@ -152,7 +152,7 @@ def _choose(coarse, *, allow_none):
 
 
 def first_choice(bins, spectrum=None):
-    """Choose reasonable settings at once: one kernel, generalised cross-validation.
+    """Choose reasonable settings at once: one kernel, generalized cross-validation.
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def best_of(spectrum, value):
 
 
 def _distinct(found):
-    """Keep the best few of different kernels or lengths: neighbours in degree hardly differ."""
+    """Keep the best few of different kernels or lengths: neighbors in degree hardly differ."""
     kept = {}
     for c in found:
         kept.setdefault((c.kernel, c.epsilon), c)
@@ -243,11 +243,11 @@ def _distinct(found):
 
 
 def _cross_validate(coarse, candidates, pilot):
-    """Mean square normalised residual of left-out groups for each candidate."""
+    """Mean square normalized residual of left-out groups for each candidate."""
     folds = coarse.folds
     total = np.zeros(len(candidates))
     if len(folds) < 2:
-        # One group alone: generalised cross-validation has the last word, and no table is judged by
+        # One group alone: generalized cross-validation has the last word, and no table is judged by
         # the raw means.
         bins = Bins(coarse)
         raw = np.sum(bins.value**2 * bins.weight[:, None]) / (2 * len(bins))

@@ -116,7 +116,7 @@ class ResidualMap:
         ix = np.minimum(((x + 0.5) * (mx / nx)).astype(int), mx - 1)
         iy = np.minimum(((y + 0.5) * (my / ny)).astype(int), my - 1)
         index = ((fold.astype(int) % N_FOLDS) * my + iy) * mx + ix
-        # Moments of position about the bin's centre, or the second ones would be differences of
+        # Moments of position about the bin's center, or the second ones would be differences of
         # large numbers.
         u = x - ((ix + 0.5) * (nx / mx) - 0.5)
         v = y - ((iy + 0.5) * (ny / my) - 0.5)
@@ -223,7 +223,7 @@ class ResidualMap:
         ky, kx = my // factor, mx // factor
         coarse = ResidualMap(self.image_shape, shape=(ky, kx))
         s = self.sums
-        # Moments move from the centres of the small bins to those of the large ones.
+        # Moments move from the centers of the small bins to those of the large ones.
         ox, oy = self._centers() - coarse._centers().repeat(factor, axis=1).repeat(factor, axis=2)
         moved = s.copy()
         moved[:, 2] += s[:, 1] * ox

@@ -2,7 +2,7 @@
 
 ::
 
-    sources, reference --prepare--> clean lists --density ratio--> sizes of neighbourhoods
+    sources, reference --prepare--> clean lists --density ratio--> sizes of neighborhoods
         --patterns--> hypotheses --coherence--> groups --grow--> smooth mapping + pairs
         --final radius--> one-to-one pairs --evidence--> accepted, or MatchError
 
@@ -13,27 +13,27 @@ The stages, in plain words:
    are tried first, then 2000, cut to about the depth of the shallower list, then all; otherwise
    all at once.
 2. **Density ratio.**  On a grid over the frame the number of sources is divided by the number of
-   reference stars.  The list with more stars must look at that many more neighbours: 8 in the
+   reference stars.  The list with more stars must look at that many more neighbors: 8 in the
    sparser list stand for 8 times the ratio in the other one.
 3. **Patterns.**  Around each of some sources spread over the frame (anchors: 16, then 49, then 196
-   with more neighbours) the neighbours are noted as (log d, theta), distances in units of the local
+   with more neighbors) the neighbors are noted as (log d, theta), distances in units of the local
    scale, and the same around every reference star that the anchor may be.  A
-   rotation and a scale common to the neighbourhood shift the whole pattern in that plane, so the
-   shift at which most neighbours coincide gives the local rotation and scale, and the number of
+   rotation and a scale common to the neighborhood shift the whole pattern in that plane, so the
+   shift at which most neighbors coincide gives the local rotation and scale, and the number of
    coincidences, against the number that the data give by chance, says how surprising it is.  Three
    box widths are tried, and the most surprising one counts (adaptive threshold).  The second-best
    candidates, wrong by necessity, show how surprising chance can be.
 4. **Coherence.**  Hypotheses that tell one story - the rotation and scale of one predicts where the
    star of the other is, up to what the curvature of the distortion may add - form groups.  The
    group with most support is tried first.
-5. **Growth.**  The group's stars and neighbours are the first pairs.  A polynomial is fitted to
+5. **Growth.**  The group's stars and neighbors are the first pairs.  A polynomial is fitted to
    them, its order chosen by leave-one-out errors, outliers clipped by their median absolute
    deviation; then all sources are paired again within a radius that is five times the error of the
    prediction.  That error is large where there are no pairs yet, so the mapping grows from where it
    is known to where it is not, and the order grows with it, until the pairs stop changing; lower
    orders are tried when it is stuck.  Then the same with all stars of both lists, without clipping
    and, where stars are sparse, with a wider radius, so that the mapping follows steep distortion
-   into the corners; what neighbouring pairs have in common (a moving local plane) is taken off
+   into the corners; what neighboring pairs have in common (a moving local plane) is taken off
    where that lowers the scatter of pairs left out.
 6. **Pairs.**  The final radius follows the scatter and the error of each star.  A pair is delivered
    only if neither side has a second candidate within the radius.

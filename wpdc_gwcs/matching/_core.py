@@ -161,7 +161,7 @@ def _match_from_start(problem, start, clock):
 
 
 def _search(problem, clock):
-    """Look stars up by their neighbourhoods until a group of them leads to a match."""
+    """Look stars up by their neighborhoods until a group of them leads to a match."""
     attempts, seen = Attempts(), frozenset()
     for seeds in find_seeds(problem):
         clock.lap("patterns")

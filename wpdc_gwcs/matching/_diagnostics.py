@@ -36,9 +36,9 @@ class MatchDiagnostics:
     mapping : SmoothMap
         The smooth mapping from starting to reference pixels; `match_planes` can start from it.
     shift : (float, float)
-        Displacement of the centre of the frame, px.
+        Displacement of the center of the frame, px.
     rotation, scale : float
-        Rotation in deg and scale of the header at the centre of the frame, from `mapping`.
+        Rotation in deg and scale of the header at the center of the frame, from `mapping`.
     parity : int
         -1 where the frame was found mirrored, else 1.
     areas : tuple of AreaEvidence

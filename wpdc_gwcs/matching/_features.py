@@ -1,10 +1,10 @@
-"""Neighbour patterns: who is who, from relative positions alone.
+"""Neighbor patterns: who is who, from relative positions alone.
 
-Around every star its neighbours are noted as ``(log d, theta)``.  A common rotation and scale of
-the neighbourhood
+Around every star its neighbors are noted as ``(log d, theta)``.  A common rotation and scale of
+the neighborhood
 is a common shift in that plane, so two stars are compared by looking for the shift at which most
 of their
-neighbours coincide; how many coincide by chance follows from how many differences there are.
+neighbors coincide; how many coincide by chance follows from how many differences there are.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ __all__ = [
     "Hypotheses",
     "compare_patterns",
     "density_ratio_map",
-    "neighbour_pattern",
+    "neighbor_pattern",
     "select_coherent",
 ]
 
@@ -30,7 +30,7 @@ BOX_WIDTHS = (0.02, 0.04, 0.08)
 _LEAST_WORTH = 1.0
 # Anchors that are looked at whatever they cost.
 _LEAST_ANCHORS = 8
-# Neighbours that must coincide for a hypothesis.
+# Neighbors that must coincide for a hypothesis.
 _LEAST_COUNT = 3
 # Differences held in memory at a time.
 _CHUNK = 2_000_000
@@ -69,16 +69,16 @@ def density_ratio_map(xs, ys, xr, yr, image_shape, *, per_cell=40.0):
     return (counts[0] + 1) / (counts[1] + 1), x_edges, y_edges
 
 
-def neighbour_pattern(tree, rows, n_neighbours):
-    """Neighbours of some stars in polar form.
+def neighbor_pattern(tree, rows, n_neighbors):
+    """Neighbors of some stars in polar form.
 
     Parameters
     ----------
     tree : `~scipy.spatial.cKDTree`
         Tree of all stars of the list.
     rows : (n,) ndarray of int
-        Stars whose neighbours are wanted.
-    n_neighbours : int
+        Stars whose neighbors are wanted.
+    n_neighbors : int
         How many.
 
     Returns
@@ -86,17 +86,17 @@ def neighbour_pattern(tree, rows, n_neighbours):
     log_distance, angle : (n, k) ndarray
         Natural logarithm of the distance in px and direction in rad; NaN where a list has too few
         stars.
-    neighbour : (n, k) ndarray of int
-        Row of each neighbour.
+    neighbor : (n, k) ndarray of int
+        Row of each neighbor.
     """
     points = tree.data
-    k = min(n_neighbours, tree.n - 1)
-    distance, neighbour = find_nearest(tree, points[rows], k + 1)
-    distance, neighbour = distance[:, 1:], neighbour[:, 1:]
-    step = points[neighbour] - points[rows][:, None, :]
+    k = min(n_neighbors, tree.n - 1)
+    distance, neighbor = find_nearest(tree, points[rows], k + 1)
+    distance, neighbor = distance[:, 1:], neighbor[:, 1:]
+    step = points[neighbor] - points[rows][:, None, :]
     with np.errstate(divide="ignore"):
         log_distance = np.where(distance > 0, np.log(distance), np.nan)
-    return log_distance, np.arctan2(step[..., 1], step[..., 0]), neighbour
+    return log_distance, np.arctan2(step[..., 1], step[..., 0]), neighbor
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +108,9 @@ class Hypotheses:
     source, reference : (n,) ndarray of int
         Rows in the two lists.
     log_scale, rotation : (n,) ndarray
-        Reference neighbourhood relative to the source's, rotation in rad.
+        Reference neighborhood relative to the source's, rotation in rad.
     count, expected : (n,) ndarray
-        Neighbours that coincide and how many would by chance.
+        Neighbors that coincide and how many would by chance.
     surprise : (n,) ndarray
         Minus the decimal logarithm of the probability that a wrong candidate looks so good.
     width : (n,) ndarray
@@ -147,7 +147,7 @@ def compare_patterns(
     budget,
     per_anchor=4,
 ):
-    """Compare the neighbour patterns of some sources with those of all reference stars in reach.
+    """Compare the neighbor patterns of some sources with those of all reference stars in reach.
 
     Parameters
     ----------
@@ -160,11 +160,11 @@ def compare_patterns(
     reach : (n,) ndarray
         Largest displacement of each anchor, px.
     n_source, n_reference : int
-        Neighbours to look at on either side.
+        Neighbors to look at on either side.
     max_log_scale, max_rotation : float
         Largest difference of local scale (natural log) and rotation (rad).
     budget : int
-        Most differences of neighbours to look at; the last anchors are left out to keep to it.
+        Most differences of neighbors to look at; the last anchors are left out to keep to it.
     per_anchor : int
         Candidates to keep for every source.
 
@@ -177,14 +177,14 @@ def compare_patterns(
     affordable = np.cumsum(sizes) * n_source * n_reference <= budget
     affordable[:_LEAST_ANCHORS] = True
     anchors, reach = anchors[affordable], reach[affordable]
-    source_log, source_angle, _ = neighbour_pattern(sources, anchors, n_source)
+    source_log, source_angle, _ = neighbor_pattern(sources, anchors, n_source)
     candidates = tree.query_ball_point(sources.data[anchors], reach, return_sorted=False)
     sizes = np.array([len(c) for c in candidates])
     if sizes.sum() == 0:
         return Hypotheses(*(np.empty(0, int),) * 2, *(np.empty(0),) * 6)
     wanted = np.concatenate([np.asarray(c, int) for c in candidates])
     rows, where = np.unique(wanted, return_inverse=True)
-    reference_log, reference_angle, _ = neighbour_pattern(tree, rows, n_reference)
+    reference_log, reference_angle, _ = neighbor_pattern(tree, rows, n_reference)
     anchor_of = np.repeat(np.arange(len(anchors)), sizes)
     per_pair = source_log.shape[1] * reference_log.shape[1]
     parts = []
@@ -256,7 +256,7 @@ def _coincidences(log_s, angle_s, log_r, angle_r, max_log_scale, max_rotation):
 
 
 def _fullest_boxes(pair, d_log, d_angle, n, max_log_scale, max_rotation):
-    """Find the most surprising box of every pattern: its surprise, half width, chance, centre.
+    """Find the most surprising box of every pattern: its surprise, half width, chance, center.
 
     Boxes of every width stand on four staggered grids, so that none straddles an edge on all of
     them.  What shares a box of one width with too few others does so in every box of half the

@@ -35,7 +35,7 @@ _ALIKE = 0.999
 # right pair: 3e-7).
 _GROW_RADIUS = 5.0
 _FINAL_RADIUS = 5.5
-# Catalogues and centroids have errors of that size at least, px.
+# Catalogs and centroids have errors of that size at least, px.
 _SMALLEST_RADIUS = 0.05
 # While growing, a radius that would be larger by no more than this factor is cut to the limit that
 # the density of stars sets; a larger one says nothing.
@@ -112,7 +112,7 @@ def grow_once(problem, points, limit, reference, pairs, max_order):
 
 
 def grow_locally(problem, points, limit, fit, pairs):
-    """Take off what neighbouring pairs have in common, and pair again until the pairs stay.
+    """Take off what neighboring pairs have in common, and pair again until the pairs stay.
 
     The pairs are nearly pure by now, so the polynomial is fitted without clipping: clipping
     would keep it from following where the distortion is steepest, in the corners.

@@ -28,7 +28,7 @@ def match_sources(
     max_mag=None,
     **options,
 ):
-    """Match detected sources to a reference catalogue.
+    """Match detected sources to a reference catalog.
 
     Parameters
     ----------
@@ -45,8 +45,8 @@ def match_sources(
     image_shape : (int, int), optional
         Shape of the frame, ``(ny, nx)``; by default that of the WCS, or what the sources span.
     epoch : float or `~astropy.time.Time`, optional
-        Epoch of the frame in Julian years, to which the catalogue is moved.  By default the
-        catalogue is taken as it is.
+        Epoch of the frame in Julian years, to which the catalog is moved.  By default the
+        catalog is taken as it is.
     max_roundness, min_snr : float
         Which sources take part, see `select_sources`.
     max_mag : float, optional
@@ -254,7 +254,7 @@ def _find_shape(wcs, x, y):
 
 
 def _tangent_plane(wcs, image_shape):
-    """Give the linear map of the plane that touches the WCS in the centre of the frame.
+    """Give the linear map of the plane that touches the WCS in the center of the frame.
 
     Returns a function from RA and Dec to pixels.
     """
@@ -267,9 +267,9 @@ def _tangent_plane(wcs, image_shape):
 
     crval, cd = local_plane(sky, *center, step=0.5)
     if not np.isfinite(crval).all():
-        raise ValueError("wcs gives no sky position for the centre of the frame")
+        raise ValueError("wcs gives no sky position for the center of the frame")
     if not np.isfinite(cd).all() or abs(np.linalg.det(cd)) == 0:
-        raise ValueError("wcs is degenerate in the centre of the frame")
+        raise ValueError("wcs is degenerate in the center of the frame")
 
     def pixels(ra, dec):
         plane = np.array(project(ra, np.where(np.abs(dec) <= 90, dec, np.nan), crval))

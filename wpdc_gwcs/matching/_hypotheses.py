@@ -1,4 +1,4 @@
-"""Hypotheses: which source may be which reference star, from the patterns of their neighbours."""
+"""Hypotheses: which source may be which reference star, from the patterns of their neighbors."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from wpdc_gwcs.matching._features import (
     N_NEIGHBOURS,
     compare_patterns,
     density_ratio_map,
-    neighbour_pattern,
+    neighbor_pattern,
     select_coherent,
 )
 from wpdc_gwcs.matching._pairs import find_nearest
@@ -19,7 +19,7 @@ from wpdc_gwcs.matching._problem import MIN_STARS, Stars
 __all__ = [
     "Seed",
     "bright_subsets",
-    "count_neighbours",
+    "count_neighbors",
     "find_groups",
     "first_pairs",
     "find_seeds",
@@ -32,10 +32,10 @@ _LEVELS = (500, 2000)
 _REFERENCE_SURPLUS = 2.0
 # Sources per star of the sparser list in a subset.
 _SOURCE_SURPLUS = 1.3
-# Stars to look up by their neighbourhood and neighbours to compare, try by try: the first finds
-# most fields in a tenth of a second, the last those where half of the neighbours are missing.
+# Stars to look up by their neighborhood and neighbors to compare, try by try: the first finds
+# most fields in a tenth of a second, the last those where half of the neighbors are missing.
 _TRIES = ((16, 8), (49, 12), (196, 24))
-# Comparisons of neighbours in one try: some seconds.
+# Comparisons of neighbors in one try: some seconds.
 _BUDGET = 100_000_000
 # Groups of hypotheses that are followed up.
 _N_SEEDS = 8
@@ -77,18 +77,18 @@ def find_seeds(problem):
         if len(rows_r) < len(reference.points):
             reference = Stars.build(reference.points[rows_r])
         rank = None if problem.flux is None else -problem.flux[rows_s]
-        for n_anchors, n_neighbours in _TRIES:
+        for n_anchors, n_neighbors in _TRIES:
             seeds = []
             for turn in turns:
                 sources = Stars.build(problem.turned(turn)[rows_s])
-                n_near, _ = count_neighbours(problem, sources, reference, N_NEIGHBOURS)
+                n_near, _ = count_neighbors(problem, sources, reference, N_NEIGHBOURS)
                 hypotheses, groups = find_groups(
                     problem,
                     sources,
                     reference,
                     rank,
                     n_anchors,
-                    n_neighbours,
+                    n_neighbors,
                     _BUDGET // len(turns),
                 )
                 lists = sources, reference, rows_s, rows_r
@@ -127,19 +127,19 @@ def bright_subsets(problem):
     yield everything
 
 
-def count_neighbours(problem, sources, reference, n_neighbours):
-    """Count the neighbours to look at on either side, for so many in the sparser list."""
+def count_neighbors(problem, sources, reference, n_neighbors):
+    """Count the neighbors to look at on either side, for so many in the sparser list."""
     ratio, _, _ = density_ratio_map(*sources.points.T, *reference.points.T, problem.shape)
     many, few = np.quantile(ratio, [0.75, 0.25])
     return tuple(
-        int(min(MAX_NEIGHBOURS, np.ceil(n_neighbours * max(1.0, surplus))))
+        int(min(MAX_NEIGHBOURS, np.ceil(n_neighbors * max(1.0, surplus))))
         for surplus in (many, 1 / few)
     )
 
 
-def find_groups(problem, sources, reference, rank, n_anchors, n_neighbours, budget):
+def find_groups(problem, sources, reference, rank, n_anchors, n_neighbors, budget):
     """Make hypotheses for a spread of anchors, and find the groups among them that agree."""
-    n_source, n_reference = count_neighbours(problem, sources, reference, n_neighbours)
+    n_source, n_reference = count_neighbors(problem, sources, reference, n_neighbors)
     anchors = _choose_anchors(problem, sources.points, rank, n_anchors)
     distance = np.hypot(*(sources.points[anchors] - problem.frame.center).T)
     limits = problem.limits
@@ -196,19 +196,19 @@ def _orientations():
     return turns + [turn @ flip for turn in turns]
 
 
-def first_pairs(sources, reference, hypotheses, n_neighbours):
+def first_pairs(sources, reference, hypotheses, n_neighbors):
     """Yield sets of pairs to start from, the most promising first."""
-    pairs = _neighbour_pairs(sources, reference, hypotheses, n_neighbours)
+    pairs = _neighbor_pairs(sources, reference, hypotheses, n_neighbors)
     yield pairs
     if len(hypotheses) > 1:
         agreeing = _agreeing_pairs(sources.points, reference.points, pairs)
         if agreeing is not None:
             yield agreeing
-    if len(hypotheses) > 1 or n_neighbours > N_NEIGHBOURS:
-        alone = _neighbour_pairs(sources, reference, hypotheses.take(slice(0, 1)), n_neighbours)
+    if len(hypotheses) > 1 or n_neighbors > N_NEIGHBOURS:
+        alone = _neighbor_pairs(sources, reference, hypotheses.take(slice(0, 1)), n_neighbors)
         yield alone
-        if n_neighbours > N_NEIGHBOURS:
-            # most neighbours are not in the other list: chance has many of them
+        if n_neighbors > N_NEIGHBOURS:
+            # most neighbors are not in the other list: chance has many of them
             agreeing = _agreeing_pairs(sources.points, reference.points, alone)
             if agreeing is not None:
                 yield agreeing
@@ -238,9 +238,9 @@ def _agreeing_pairs(sources, reference, pairs):
     return i[keep], j[keep]
 
 
-def _neighbour_pairs(sources, reference, hypotheses, n_neighbours):
-    """First pairs: the stars of a group of hypotheses and neighbours that coincide."""
-    log_d, angle, neighbour = neighbour_pattern(sources.tree, hypotheses.source, n_neighbours)
+def _neighbor_pairs(sources, reference, hypotheses, n_neighbors):
+    """First pairs: the stars of a group of hypotheses and neighbors that coincide."""
+    log_d, angle, neighbor = neighbor_pattern(sources.tree, hypotheses.source, n_neighbors)
     distance = np.exp(log_d + hypotheses.log_scale[:, None])
     angle = angle + hypotheses.rotation[:, None]
     place = reference.points[hypotheses.reference][:, None, :] + np.stack(
@@ -250,7 +250,7 @@ def _neighbour_pairs(sources, reference, hypotheses, n_neighbours):
     gap, found = gap.reshape(distance.shape), found.reshape(distance.shape)
     good = np.isfinite(distance) & (gap <= 0.7 * hypotheses.width[:, None] * distance)
     relative = np.where(good, gap / distance, np.inf)
-    i = np.concatenate([hypotheses.source, neighbour[good]])
+    i = np.concatenate([hypotheses.source, neighbor[good]])
     j = np.concatenate([hypotheses.reference, found[good]])
     relative = np.concatenate([np.zeros(len(hypotheses)), relative[good]])
     # one pair per star of either list: the closest

@@ -1,4 +1,4 @@
-"""What a polynomial leaves: a moving local plane through the residuals of neighbouring pairs."""
+"""What a polynomial leaves: a moving local plane through the residuals of neighboring pairs."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -51,12 +51,12 @@ class LocalCorrection:
         positions : (M, 2) ndarray
             Starting positions, px.
         leave_out : bool
-            The positions are the pairs themselves: use the neighbours of each pair only.
+            The positions are the pairs themselves: use the neighbors of each pair only.
 
         Returns
         -------
         correction : (M, 2) ndarray
-            What to add to the mapped positions, px; zero where the neighbours lie on a line.
+            What to add to the mapped positions, px; zero where the neighbors lie on a line.
         leverage : (M,) ndarray
             Variance of the correction in units of the variance of one pair.
         """

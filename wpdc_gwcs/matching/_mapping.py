@@ -98,13 +98,13 @@ class SmoothMap:
     order : int
         Total degree of the polynomial.
     coefficients : (2, n_terms) ndarray
-        Displacement in x and y, in products of Chebyshev polynomials of the normalised coordinates
+        Displacement in x and y, in products of Chebyshev polynomials of the normalized coordinates
         sorted by
         total degree.
     center : (2,) ndarray
-        Where the normalised coordinates are zero, px.
+        Where the normalized coordinates are zero, px.
     scale : float
-        Pixels per normalised unit.
+        Pixels per normalized unit.
 
     Notes
     -----
@@ -130,7 +130,7 @@ class SmoothMap:
 
     @classmethod
     def identity(cls, image_shape):
-        """Make the mapping that moves nothing, normalised to a frame of the shape ``(ny, nx)``."""
+        """Make the mapping that moves nothing, normalized to a frame of the shape ``(ny, nx)``."""
         ny, nx = image_shape
         return cls(
             1, np.zeros((2, 3)), np.array([0.5 * (nx - 1), 0.5 * (ny - 1)]), 0.5 * max(nx, ny)
@@ -165,12 +165,12 @@ class SmoothMap:
         return x + out[0].reshape(x.shape), y + out[1].reshape(y.shape)
 
     def linear_part(self):
-        """Shift at the centre of the frame and the matrix of first derivatives there.
+        """Shift at the center of the frame and the matrix of first derivatives there.
 
         Returns
         -------
         shift : (2,) ndarray
-            Displacement of the centre, px.
+            Displacement of the center, px.
         matrix : (2, 2) ndarray
             Derivatives of the mapped position with respect to the starting position.
         """
@@ -262,7 +262,7 @@ def fit_smooth_map(
     x_ref, y_ref : (N,) ndarray
         Reference positions, px.
     center, scale
-        Normalisation of the coordinates, see `SmoothMap`.
+        Normalization of the coordinates, see `SmoothMap`.
     max_order : int
         Highest order to try.
     clip : float

@@ -19,9 +19,9 @@ class MatchOptions:
     max_shift : float, optional
         Largest error of the pointing, px; default 0.15 of the longer side, at least 450 px.
     max_rotation : float
-        Largest error of the rotation at the centre of the frame, deg.
+        Largest error of the rotation at the center of the frame, deg.
     max_scale : float
-        Largest relative error of the scale at the centre of the frame.
+        Largest relative error of the scale at the center of the frame.
     max_distortion : float, optional
         Largest displacement by distortion on the frame, px; default 250, and at most 0.12 of the
         longer side.

@@ -59,7 +59,7 @@ class Limits:
         return 2 * self.max_distortion / self.half_diagonal
 
     def reach(self, distance):
-        """Largest displacement at a distance from the centre of the frame."""
+        """Largest displacement at a distance from the center of the frame."""
         linear = np.deg2rad(self.max_rotation) + self.max_scale
         return (
             self.max_shift
@@ -87,7 +87,7 @@ class Problem:
     options: MatchOptions
 
     def turned(self, turn):
-        """Turn all sources about the centre of the frame."""
+        """Turn all sources about the center of the frame."""
         return (self.sources - self.frame.center) @ turn.T + self.frame.center
 
 
@@ -207,7 +207,7 @@ def _combine_errors(x_err, y_err, n):
 
 
 def _crowding_limit(points, tree):
-    """Radius within which `MAX_CROWDING` stars are expected, by the sixth neighbour."""
+    """Radius within which `MAX_CROWDING` stars are expected, by the sixth neighbor."""
     k = min(6, tree.n - 1)
     if k < 1:
         return np.full(tree.n, np.inf)

@@ -192,7 +192,7 @@ def prefer(one, other):
         f"the match is ambiguous: {one.evidence.n_pairs} pairs "
         f"({one.evidence.significance:.1f} sigma) and {other.evidence.n_pairs} pairs "
         f"({other.evidence.significance:.1f} sigma) of two mappings that are {gap:.4g} px "
-        "apart suit about equally well: the field or the catalogue repeats itself"
+        "apart suit about equally well: the field or the catalog repeats itself"
     )
 
 
@@ -223,7 +223,7 @@ def without_rival(problem, match, clock):
         match = better
     raise MatchError(
         f"the match is ambiguous: {_MOST_RIVALS} times over another shift suited the sources "
-        "better: the field or the catalogue repeats itself"
+        "better: the field or the catalog repeats itself"
     )
 
 

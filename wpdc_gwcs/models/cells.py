@@ -391,11 +391,11 @@ class CellGrid:
         """
         m = polynomial.shape[1]
         shifts = []
-        for low, step, n, centre in (
+        for low, step, n, center in (
             (self.x_low, self.x_step, self.nx, origin[0]),
             (self.y_low, self.y_step, self.ny, origin[1]),
         ):
-            edge = low - centre + step * np.arange(-1, n + 1)
+            edge = low - center + step * np.arange(-1, n + 1)
             shift = np.zeros((n + 2, m, m))
             for p in range(m):
                 for a in range(p + 1):

@@ -75,12 +75,12 @@ def fit_polynomial(points, values, degree):
         ``polynomial[k, p, q]`` multiplies ``u**p v**q`` in output k, (u, v) being the point minus
         origin.
     origin : (float, float)
-        Centre of the points.
+        Center of the points.
     """
     origin = tuple(0.5 * (point.min() + point.max()) for point in points)
     # Scaled for the solution, not for its use: floating-point powers lose nothing.
     scale = 0.5 * max(np.ptp(point) for point in points)
-    u, v = ((point - centre) / scale for point, centre in zip(points, origin, strict=True))
+    u, v = ((point - center) / scale for point, center in zip(points, origin, strict=True))
     powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p)]
     matrix = np.stack([u**p * v**q for p, q in powers], axis=1)
     fit = np.linalg.lstsq(matrix, np.stack(values, axis=1), rcond=None)[0]
@@ -108,10 +108,10 @@ def shift_origin(polynomial, origin):
     n = polynomial.shape[1]
     shifts = [
         [
-            [math.comb(p, a) * (-centre) ** (p - a) if a <= p else 0.0 for p in range(n)]
+            [math.comb(p, a) * (-center) ** (p - a) if a <= p else 0.0 for p in range(n)]
             for a in range(n)
         ]
-        for centre in origin
+        for center in origin
     ]
     return np.einsum("ap,bq,kpq->kab", *map(np.array, shifts), polynomial)
 

@@ -16,7 +16,7 @@ class Distortion:
     image_shape : (int, int)
         Shape of the detector ``(ny, nx)``.
     axis : complex
-        Where the optical axis is, in half-widths of the detector from its centre.
+        Where the optical axis is, in half-widths of the detector from its center.
     radial : (float, float)
         Cubic and quintic coefficients of the radial distortion about that axis.
     terms : dict
@@ -32,7 +32,7 @@ class Distortion:
         D(z) = (z - a)(k_3 |z - a|^2 + k_5 |z - a|^4) + \sum_{m+n=2}^{6} c_{mn} z^m \bar z^n
                - T_1(z) + \sum_j A_j \sin(\mathrm{Re}\,\bar\kappa_j z + \phi_j)
 
-    where :math:`T_1` takes the constant and the linear part of the radial term at the centre away:
+    where :math:`T_1` takes the constant and the linear part of the radial term at the center away:
     they belong to the linear WCS.  The inverse is Newton's iteration with the Wirtinger derivatives
     :math:`D_z, D_{\bar z}`.
     """
@@ -109,18 +109,18 @@ class Distortion:
         return distortion
 
     @property
-    def centre(self):
-        """Centre of the detector ``(x, y)``, zero based: the point that the distortion leaves."""
+    def center(self):
+        """Center of the detector ``(x, y)``, zero based: the point that the distortion leaves."""
         ny, nx = self.image_shape
         return (nx - 1) / 2, (ny - 1) / 2
 
     def _normalise(self, x, y):
-        x0, y0 = self.centre
+        x0, y0 = self.center
         z = (np.asarray(x, float) - x0) + 1j * (np.asarray(y, float) - y0)
         return z / (max(self.image_shape) / 2)
 
     def _pixels(self, z):
-        x0, y0 = self.centre
+        x0, y0 = self.center
         half = max(self.image_shape) / 2
         return z.real * half + x0, z.imag * half + y0
 

@@ -27,7 +27,7 @@ class Simulation:
     Parameters
     ----------
     reference : `astropy.table.QTable`
-        Reference catalogue with Gaia's column names: ``source_id``, ``ra``, ``dec``, ``ra_error``,
+        Reference catalog with Gaia's column names: ``source_id``, ``ra``, ``dec``, ``ra_error``,
         ``dec_error``, ``pmra``, ``pmdec``, ``ref_epoch``, ``phot_g_mean_mag``.
     exposures : tuple of SimulatedExposure
         The exposures.
@@ -94,7 +94,7 @@ def simulate(
     pixel_scale : `~astropy.units.Quantity`, optional
         Angle of a pixel.
     center : `~astropy.coordinates.SkyCoord`, optional
-        Centre of the field; RA 120 deg, Dec +30 deg by default.
+        Center of the field; RA 120 deg, Dec +30 deg by default.
     roll : `~astropy.units.Quantity`, optional
         Position angle of the detector's y axis, north through east.
     distortion : float, optional
@@ -108,9 +108,9 @@ def simulate(
     slope : float, optional
         Slope of the luminosity function, d log10 N / d mag.
     reference_limit : float, optional
-        Faintest magnitude of the reference catalogue; all stars by default.
+        Faintest magnitude of the reference catalog; all stars by default.
     cluster : float, optional
-        Share of the stars that are members of a star cluster at the centre.
+        Share of the stars that are members of a star cluster at the center.
     cluster_radius : `~astropy.units.Quantity`, optional
         Core radius of the cluster.
     proper_motion : `~astropy.units.Quantity`, optional
@@ -118,7 +118,7 @@ def simulate(
     epoch : float or (n_exposures,) array_like, optional
         Epoch of the exposures, Julian years; the reference is at 2016.0.
     dither : `~astropy.units.Quantity`, optional
-        Exposures point within this angle of the centre, per axis.
+        Exposures point within this angle of the center, per axis.
     pointing_error, roll_error : `~astropy.units.Quantity`, optional
         Scatter of the true pointing (per axis) and roll about the header's.
     scale_error : float, optional
@@ -147,7 +147,7 @@ def simulate(
     Returns
     -------
     Simulation
-        Reference catalogue and exposures.
+        Reference catalog and exposures.
 
     Raises
     ------
@@ -350,7 +350,7 @@ def _linear_wcs(optics, scale, crval, roll):
     wcs = WCS(naxis=2)
     wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
     wcs.wcs.cunit = ["deg", "deg"]
-    wcs.wcs.crpix = np.add(optics.centre, 1)
+    wcs.wcs.crpix = np.add(optics.center, 1)
     wcs.wcs.crval = crval
     c, s = np.cos(np.deg2rad(roll)), np.sin(np.deg2rad(roll))
     wcs.wcs.cd = scale / 3600 * np.array([[-c, s], [s, c]])

@@ -32,7 +32,7 @@ def write_simulation(
     Returns
     -------
     dict
-        ``"reference"``: path of the catalogue; ``"frames"``: list with one path per exposure, image
+        ``"reference"``: path of the catalog; ``"frames"``: list with one path per exposure, image
         or source list; ``"headers"``: list of paths of the text headers, `None` where the frame has
         its own.
 

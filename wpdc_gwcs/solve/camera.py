@@ -171,12 +171,12 @@ def solve(
     >>> import numpy as np
     >>> from wpdc_gwcs.solve import Exposure, solve
     >>> from wpdc_gwcs.models import deproject
-    >>> cd, centre, rng = np.array([[-2e-5, 0], [0, 2e-5]]), 1023.5, np.random.default_rng(1)
+    >>> cd, center, rng = np.array([[-2e-5, 0], [0, 2e-5]]), 1023.5, np.random.default_rng(1)
     >>> exposures = []
     >>> for k in range(3):
     ...     x, y = rng.uniform(0, 2047, (2, 500))
-    ...     u, v = (x - centre) / 1024, (y - centre) / 1024
-    ...     plane = cd @ [x - centre + 3 * u * (u**2 + v**2), y - centre]
+    ...     u, v = (x - center) / 1024, (y - center) / 1024
+    ...     plane = cd @ [x - center + 3 * u * (u**2 + v**2), y - center]
     ...     ra, dec = deproject(*plane, (120.0 + 0.01 * k, 30.0))
     ...     exposures.append(Exposure(f"e{k}", x, y, ra, dec, crval=(120.0, 30.0), cd=cd))
     >>> result = solve(exposures, image_shape=(2048, 2048))
