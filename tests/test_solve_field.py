@@ -242,6 +242,25 @@ class TestLearnSpectra:
         assert max(s.amplitude for s in forced.values()) < 0.01
         assert learn_spectra({}, make, **options) == {}
 
+    @pytest.mark.parametrize(("share", "is_theirs"), [(0.0, False), (0.3, False), (3.0, True)])
+    def test_what_all_have_in_common_is_the_detectors(self, rng, share, is_theirs):
+        """Fields of the exposures beside one that is the same in all, so many times as large."""
+        truth, basis = Spectrum(0.03, 800.0), patch(LOW, HIGH, 60)
+        size = len(truth.prior(basis))
+        common, *own = np.sqrt(truth.prior(basis)) * rng.normal(size=(5, size))
+        data = {}
+        for e in range(4):
+            focal = places(rng, 250)
+            field = basis.design(focal) @ (common + share * own[e])
+            noise = rng.normal(0, 0.02, field.shape)
+            data[e] = focal, field + noise, np.full(field.shape, 0.02**-2)
+
+        def make(frame, kinds):
+            return products(basis, *data[frame], kinds=kinds)
+
+        found = learn_spectra({e: [e] for e in data}, make, start=0.02, scales=self.SCALES)
+        assert all((s is not None) == is_theirs for s in found.values())
+
     def test_a_stretched_field(self, rng):
         truth = Spectrum(0.08, 600.0, 2.0, 0.6)
         basis = patch(LOW, HIGH, 100)
