@@ -26,6 +26,10 @@ _STARS_PER_WAVE_MARGINAL, _STARS_PER_WAVE = 3, 4
 # Stars of a detector, of all exposures, that tell its waves.
 _LEAST_WAVES = 100
 
+# Steps of the grid that waves are sampled on: twice those of a table, so that its nodes, and what
+# the rims have at the outermost ones, are among them.
+_STEPS_WAVES = 98
+
 # With more stars on each detector than this, its table finds by itself what else the exposures
 # share, in more detail than a field.
 _TABLE_ALONE = 6000
@@ -197,7 +201,7 @@ def with_statics(o, state):
         stars[k] += [np.concatenate([p[i] for p in parts], axis=1) for i in (1, 2)]
         if stars[k][0].shape[1] >= _LEAST_WAVES:
             box = _box(o, state, k, 0.0)
-            statics[k] = of_field(fit_waves(*box, *stars[k]), *box)
+            statics[k] = of_field(fit_waves(*box, *stars[k]), *box, least_steps=_STEPS_WAVES)
             stars[k][1] = stars[k][1] - statics[k](stars[k][0])
     for k, field in _common_fields(o, state, stars).items():
         statics[k] = SummedField((statics[k], field)) if k in statics else field

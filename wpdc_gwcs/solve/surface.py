@@ -10,9 +10,6 @@ __all__ = ["SampledField", "SummedField", "TableSurface", "of_field", "of_table"
 # Nodes for the shortest wave of a field: the spline then is good to a thousandth of it.
 _NODES_PER_WAVE = 6
 
-# Steps over a box at least: twice those of a table, so that its nodes are among them.
-_LEAST_STEPS = 98
-
 # Steps by which the grid of a field reaches beyond its box on each side: distortion takes stars
 # over the rim.
 _BEYOND = 2
@@ -157,7 +154,7 @@ def of_table(table):
     )
 
 
-def of_field(field, low, high):
+def of_field(field, low, high, *, least_steps=1):
     """Sample a field over a box of the focal plane.
 
     Parameters
@@ -166,6 +163,8 @@ def of_field(field, low, high):
         Field.
     low, high : (2,) ndarray
         Corners, px.
+    least_steps : int, optional
+        Of the grid, over the box.
 
     Returns
     -------
@@ -174,7 +173,7 @@ def of_field(field, low, high):
     """
     size = high - low
     shortest = 2 * np.pi / np.abs(field.wave).max(axis=1)
-    steps = np.maximum(np.ceil(_NODES_PER_WAVE * size / shortest).astype(int), _LEAST_STEPS)
+    steps = np.maximum(np.ceil(_NODES_PER_WAVE * size / shortest).astype(int), least_steps)
     grids = [a + s / n * np.arange(-_BEYOND, n + _BEYOND + 1) for a, s, n in zip(low, size, steps)]
     x, y = np.meshgrid(*grids, indexing="ij")
     values = field(np.array([x.ravel(), y.ravel()])).reshape(2, *x.shape)
