@@ -240,7 +240,23 @@ def _covariance(sigma, image_shape, x, y):
     edges = [np.linspace(-0.5, n - 0.5, m) for n, m in zip(image_shape, nodes.shape)]
     interpolate = RegularGridInterpolator(edges, nodes, bounds_error=False, fill_value=np.nan)
     points = np.stack([y.ravel(), x.ravel()], axis=-1)
-    sigma_x, sigma_y, rho = interpolate(points).T.reshape(3, *x.shape)
+    return covariance_of(interpolate(points).T.reshape(3, *x.shape))
+
+
+def covariance_of(sigma):
+    """Covariance matrices of standard deviations and correlations.
+
+    Parameters
+    ----------
+    sigma : (3, ...) ndarray
+        Standard deviations along both axes, and their correlation.
+
+    Returns
+    -------
+    (2, 2, ...) ndarray
+        Squares of their unit.
+    """
+    sigma_x, sigma_y, rho = sigma
     cross = rho * sigma_x * sigma_y
     return np.array([[sigma_x**2, cross], [cross, sigma_y**2]])
 

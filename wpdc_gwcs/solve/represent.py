@@ -6,7 +6,7 @@ import numpy as np
 
 from wpdc_gwcs.fitting import WPDCFitter, fit_attitude, robust_sigma
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
-from wpdc_gwcs.solution import DistortionSolution
+from wpdc_gwcs.solution import DistortionSolution, covariance_of
 from wpdc_gwcs.solve.exposure import ExposureFit
 from wpdc_gwcs.solve.geometry import mean_direction
 from wpdc_gwcs.solve.model import block, colored, undistorted
@@ -106,22 +106,10 @@ def sigma_grid(covariance, n):
     return np.array([*sigma, rho]).reshape(3, n, n)
 
 
-def grid_covariance(sigma):
-    """Covariance matrices ``(2, 2, N)`` of a grid of sigmas and correlations.
-
-    Parameters
-    ----------
-    sigma : (3, n, n) ndarray
-        Sigmas of both axes and their correlation.
-    """
-    sx, sy, rho = sigma.reshape(3, -1)
-    return np.array([[sx**2, rho * sx * sy], [rho * sx * sy, sy**2]])
-
-
 def _instrument_sigma(o, state, frame, x, y, table_sigma):
     """Uncertainty of what the exposures share, without what their attitudes take, on a grid."""
     n = int(np.sqrt(len(x)))
-    table = None if table_sigma is None else grid_covariance(table_sigma)
+    table = None if table_sigma is None else covariance_of(table_sigma.reshape(3, -1))
     covariance = predict_variance(o, state, frame, x, y, table=table, instrument_only=True)
     return sigma_grid(covariance, n)
 
