@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from wpdc_gwcs.solve.evidence import learn_sequence
+from wpdc_gwcs.solve.errors import extrapolation
+from wpdc_gwcs.solve.evidence import inflation, learn_sequence
 
 DECAY, SCATTER = 2.5, 1.2
 
@@ -40,3 +41,25 @@ def test_what_no_star_tells_follows_the_degree_before():
     for _ in range(500):
         sigma = learn_sequence(count * sigma**2 * [0, 1, 1] + [4000, 0, 0], count, sigma, DECAY)
     assert_allclose(sigma, [2.0, 2.0 / DECAY, 2.0 / DECAY**2], rtol=0.02)
+
+
+def test_sizes_of_few_detectors_are_uncertain():
+    """One independent number for two degrees: exp(1 / (2 n)) with n = 1/2 for each at most."""
+    many = np.array([1e6, 1e6])
+    assert_allclose(inflation(many, 1), np.exp(0.5), rtol=1e-5)
+    assert_allclose(inflation(many, 100), np.exp(0.005), rtol=1e-3)
+    assert inflation(np.array([1.0, 0.2]), 1) > inflation(np.array([3.0, 2.0]), 1)
+    assert np.isfinite(inflation(np.zeros(3), 1))
+
+
+def test_errors_grow_far_from_the_stars(rng):
+    """None in between, none in the gaps of many stars, and no end."""
+    stars = np.stack([rng.uniform(-1, 0, 50), rng.uniform(-1, 1, 50)])
+    factor = extrapolation(stars, np.array([[-0.5, 0.1, 0.4, 1.0], [0.0, 0.0, 0.0, 0.0]]))
+    assert factor[0] == pytest.approx(1.0, abs=0.3)
+    assert np.all(np.diff(factor) >= 0)
+    assert factor[3] == pytest.approx(2.3, abs=0.1)  # 3.5 spacings of 0.28
+    assert np.all(extrapolation(stars, stars) == 1.0)
+    many = rng.uniform(-1, 1, (2, 5000))
+    assert np.all(extrapolation(many, rng.uniform(-1, 1, (2, 500))) == 1.0)
+    assert np.all(extrapolation(np.zeros((2, 0)), many) > 1.0)

@@ -25,7 +25,7 @@ class System:
                     "design": rng.normal(size=(2, n, sum(SIZES))),
                     "residual": rng.normal(size=(2, n)),
                     "weight": rng.uniform(0.5, 3.0, (2, n)),
-                    "field": (rng.normal(size=(2, n, 6)), rng.uniform(0.1, 2.0, 6))
+                    "field": (rng.normal(size=(6, 2, n)), rng.uniform(0.1, 2.0, 6))
                     if field
                     else None,
                 }
@@ -64,7 +64,7 @@ class System:
             rows[:, self.columns(d, e)] = f["design"].reshape(len(rows), -1)
             noise = np.diag(1 / f["weight"].ravel())
             if f["field"] is not None:
-                basis = f["field"][0].reshape(len(rows), -1)
+                basis = f["field"][0].reshape(6, -1).T
                 noise = noise + basis @ np.diag(f["field"][1]) @ basis.T
             inverse = np.linalg.inv(noise)
             matrix += rows.T @ inverse @ rows

@@ -55,7 +55,15 @@ def test_only_chromatic_terms_depend_on_color(term, block):
 def test_polynomials_are_products_of_legendre(term, place, block):
     a, b = (block.u, block.v) if place == "detector" else block.focal
     powers = [(n - j, j) for n in range(2, 5) for j in range(n + 1)]
-    expected = np.stack([eval_legendre(i, a) * eval_legendre(j, b) for i, j in powers], axis=1)
+    # Of the mean square of that of one coordinate alone.
+    expected = np.stack(
+        [
+            eval_legendre(i, a) * eval_legendre(j, b)
+            * np.sqrt((2 * i + 1) * (2 * j + 1) / (2 * (i + j) + 1))
+            for i, j in powers
+        ],
+        axis=1,
+    )  # fmt: skip
     design = term.design(block)
     p = len(powers)
     assert_allclose(design[0, :, :p], expected, atol=1e-14)

@@ -212,13 +212,11 @@ def solve(
         state = _settled(o, with_statics(o, state), clip, pool_attitudes)
         state = with_error_models(o, state)
     if lut != "none" and not stored and not alone:
-        # Errors are what they are only once a first table has taken the fine structure.
-        state, _ = with_tables(o, state, group, n_grid, lut, draft=True)
-        state = with_error_models(o, _settled(o, state, clip, pool_attitudes))
         if choices is None:
             choices = choose_tables(residual_maps(o, state, group), lut)
         state, infos = with_tables(o, state, group, n_grid, lut, choices=choices, draft=True)
-        state = with_error_models(o, _settled(o, state, clip, pool_attitudes))
+        if any(table is not None for table in state.model.tables):
+            state = with_error_models(o, _settled(o, state, clip, pool_attitudes))
     # Without a table there is nothing to write a field down in, unless it is asked for.
     if refine == "field" or (refine == "auto" and lut != "none"):
         for _ in range(_ROUNDS_FIELD):

@@ -2,10 +2,18 @@
 
 import numpy as np
 from scipy.optimize import nnls
+from scipy.spatial import cKDTree
 
 from wpdc_gwcs.fitting import robust_sigma
 
-__all__ = ["clip_outliers", "error_model", "frame_scale", "linear_scatter", "worse_scatter"]
+__all__ = [
+    "clip_outliers",
+    "error_model",
+    "extrapolation",
+    "frame_scale",
+    "linear_scatter",
+    "worse_scatter",
+]
 
 # Scale, rotation and the two shears of a small linear map (bxx, bxy, byx, byy).
 MODES = np.array([[1, 0, 0, 1], [0, -1, 1, 0], [1, 0, 0, -1], [0, 1, 1, 0]]) / np.sqrt(2)
@@ -16,6 +24,12 @@ _POOLED_FREEDOM = 200.0
 
 # Degrees of freedom that the stated errors count for: a few stars do not prove them wrong.
 _STATED_FREEDOM = 40.0
+
+# What the stars do not see has heavier tails than a normal distribution: growth of the errors with
+# the distance to the nearest star in units of the stars' spacing, beyond one spacing and up to so
+# many more.  More stars than this do not make gaps of smaller ones.  From benchmarks/few_stars.py:
+# three sigma are to hold 99 % of the errors where there are no stars.
+_GROWTH, _FARTHEST, _ENOUGH_STARS = 0.5, 3.0, 100
 
 
 def worse_scatter(values):
@@ -153,6 +167,27 @@ def frame_scale(pull, freedom):
     """
     own = np.mean([robust_sigma(p) ** 2 for p in pull])
     return float(np.sqrt((freedom * own + _POOLED_FREEDOM) / (freedom + _POOLED_FREEDOM)))
+
+
+def extrapolation(stars, places):
+    """Factors of the standard deviations of a distortion for the distance to its stars.
+
+    Parameters
+    ----------
+    stars, places : (2, N) ndarray
+        Where the stars are and where factors are wanted, -1 to 1 along each side of the detector.
+
+    Returns
+    -------
+    (N,) ndarray
+        1 among the stars, and larger far from them.
+    """
+    n = stars.shape[1]
+    if not n:
+        return np.full(places.shape[1], 1.0 + _GROWTH * _FARTHEST)
+    spacing = 2.0 / np.sqrt(min(n, _ENOUGH_STARS))
+    distance, _ = cKDTree(stars.T).query(places.T)
+    return 1.0 + _GROWTH * np.clip(distance / spacing - 1.0, 0.0, _FARTHEST)
 
 
 def linear_scatter(b, covariance):

@@ -10,8 +10,9 @@ _LOG_SCATTER = 1.2
 
 _NEWTON_STEPS = 30
 
-# Exponent of the standard deviation for the uncertainty of its logarithm, see `inflation`.
-_TAILS = 1.5
+# Numbers that the coefficients of one degree are worth, of one detector: those of a radial
+# distortion are all the same one, for all degrees.
+_INDEPENDENT = 0.5
 
 
 def learn_sequence(square, count, sigma, decay):
@@ -39,7 +40,9 @@ def learn_sequence(square, count, sigma, decay):
     that a degree about which the stars say nothing is taken to be somewhat smaller than the one
     below it, and never to be zero.
     """
-    walk = _walk(len(count))
+    # Precision of a random walk of the logarithm.
+    step = np.diff(np.eye(len(count)), axis=0)
+    walk = step.T @ step / _LOG_SCATTER**2
     # (l_i - l_{i-1} + ln decay)^2 / (2 scatter^2), its gradient at zero
     offset = np.zeros(len(count))
     offset[1:] += np.log(decay) / _LOG_SCATTER**2
@@ -55,31 +58,25 @@ def learn_sequence(square, count, sigma, decay):
     return np.exp(log)
 
 
-def inflation(determined):
-    """Factors of a sequence of standard deviations for what is not known of them.
+def inflation(determined, holders):
+    """Return the factor of a sequence of standard deviations for what is not known of them.
 
     Parameters
     ----------
     determined : (G,) ndarray
         Number of coefficients of each group that the stars determine.
+    holders : int
+        Detectors that they are the coefficients of.
 
     Returns
     -------
-    (G,) ndarray
-        1 where many coefficients tell the size of their group, and larger the fewer there are.
+    float
+        Near 1 where many detectors tell the sizes of the groups, and larger the less is known.
 
     Notes
     -----
-    The logarithm of a standard deviation is known to v = 1 / (2 n) from n coefficients, and from
-    its neighbors by the random walk; for a normal distribution of the logarithm, the mean of the
-    variance is exp(2 v) times its mode.  Three sigma are to hold 99 % of the extrapolations, whose
-    tails are heavier than normal: exp(3 v), from `benchmarks/few_stars.py`.
+    The logarithm of a standard deviation is known to v = 1 / (2 n) from n independent numbers; for
+    a normal distribution of the logarithm, the mean of the variance is exp(2 v) times its mode.
     """
-    precision = _walk(len(determined)) + np.diag(2.0 * np.maximum(determined, 1e-3))
-    return np.exp(_TAILS * np.diagonal(np.linalg.inv(precision)))
-
-
-def _walk(n):
-    """Precision of a random walk of n steps of the logarithm."""
-    step = np.diff(np.eye(n), axis=0)
-    return step.T @ step / _LOG_SCATTER**2
+    known = 1.0 / (1.0 / np.maximum(determined, 1e-3) + 1.0 / (_INDEPENDENT * holders))
+    return float(np.exp(0.5 / np.sum(known)))

@@ -14,7 +14,7 @@ spectrum is the prior of their coefficients, and so the field is one more term w
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, lapack
+from scipy.linalg import cho_solve, lapack
 from scipy.optimize import minimize
 
 __all__ = [
@@ -87,26 +87,47 @@ class Basis:
         ndarray
             The last two columns are a constant along each axis.
         """
-        sines, cosines = [], []
-        for a in range(2):
-            steps = np.arange(self.orders[a].max() + 1)
-            phase = np.outer(
-                (focal[a] - self.center[a] + self.half[a]) * (0.5 * np.pi / self.half[a]), steps
+        return np.moveaxis(self.shapes(focal, kind), 0, -1)
+
+    def shapes(self, focal, kind="curl-free"):
+        """Return `design` with the coefficients first, as it lies in memory: ``(K, 2, N)``.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+        kind : {'curl-free', 'axes'}, optional
+            Gradient of a potential, or each axis by itself.
+
+        Returns
+        -------
+        ndarray
+            The last two are a constant along each axis.
+        """
+        phases = [
+            np.outer(
+                np.arange(self.orders[a].max() + 1),
+                (focal[a] - self.center[a] + self.half[a]) * (0.5 * np.pi / self.half[a]),
             )
-            sines.append(np.sin(phase)[:, self.orders[a]])
-            cosines.append(np.cos(phase)[:, self.orders[a]] if kind == "curl-free" else None)
-        n, m = focal.shape[1], self.orders.shape[1]
+            for a in range(2)
+        ]
+        m = self.orders.shape[1]
         norm = 1.0 / np.sqrt(np.prod(self.half))
         size = m if kind == "curl-free" else 2 * m
-        out = np.zeros((2, n, size + 2))
+        out = np.zeros((size + 2, 2, focal.shape[1]))
+        sines = [np.sin(phase) for phase in phases]
         if kind == "curl-free":
             wave = self.wave * norm
-            np.multiply(cosines[0] * wave[0], sines[1], out=out[0, :, :m])
-            np.multiply(cosines[1] * wave[1], sines[0], out=out[1, :, :m])
+            for a in range(2):
+                along = np.cos(phases[a])[self.orders[a]]
+                along *= wave[a][:, None]
+                np.multiply(along, sines[1 - a][self.orders[1 - a]], out=out[:m, a])
         else:
-            np.multiply(sines[0] * norm, sines[1], out=out[0, :, :m])
-            out[1, :, m : 2 * m] = out[0, :, :m]
-        out[0, :, size] = out[1, :, size + 1] = 1.0
+            first = sines[0][self.orders[0]]
+            first *= norm
+            np.multiply(first, sines[1][self.orders[1]], out=out[:m, 0])
+            out[m : 2 * m, 1] = out[:m, 0]
+        out[size, 0] = out[size + 1, 1] = 1.0
         return out
 
 
@@ -271,13 +292,12 @@ def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
     w = weight.ravel()
     r = residual.ravel()
     for kind in kinds:
-        design = basis.design(focal, kind)
-        rows = design.reshape(-1, design.shape[2])
-        heavy = rows * w[:, None]
-        g, h = heavy.T @ rows, heavy.T @ r
+        shapes = basis.shapes(focal, kind)
+        shapes = shapes.reshape(len(shapes), -1) * np.sqrt(w)
+        g, h = shapes @ shapes.T, shapes @ (np.sqrt(w) * r)
         if nuisance is not None:
             free = nuisance.reshape(-1, nuisance.shape[2])
-            cross = free.T @ heavy
+            cross = (shapes @ (free * np.sqrt(w)[:, None])).T
             normal = (free * w[:, None]).T @ free
             solved = np.linalg.lstsq(
                 normal, np.column_stack([cross, (free * w[:, None]).T @ r]), rcond=1e-12
@@ -463,7 +483,8 @@ class Field:
         ndarray
             Px of the focal plane.
         """
-        return self.basis.design(focal, self.spectrum.kind) @ self.coefficients
+        shapes = self.basis.shapes(focal, self.spectrum.kind)
+        return (self.coefficients @ shapes.reshape(len(shapes), -1)).reshape(2, -1)
 
     def conditioned(self, focal, rows, focal_stars, star_rows, weight):
         """Rows of other terms less what the field follows, and the field's own covariance.
@@ -488,14 +509,13 @@ class Field:
         covariance : (2, 2, N) ndarray
             Of the field, the other terms fixed, with what the waves are too long for.
         """
-        root = self._prior_root
         weight = 1.0 / (1.0 / weight + self.spectrum.unresolved(self.basis))
-        waves = self.basis.design(focal_stars, self.spectrum.kind) * root
-        flat = waves.reshape(-1, waves.shape[2])
-        right = flat.T @ (star_rows.reshape(len(flat), -1) * weight.reshape(-1, 1))
-        here = self.basis.design(focal, self.spectrum.kind) * root
+        waves = self._scaled(focal_stars)
+        flat = star_rows.reshape(waves.shape[1], -1)
+        right = waves @ (flat * weight.reshape(-1, 1))
+        here = self._scaled(focal)
         solved = cho_solve((self.root, True), right, check_finite=False)
-        return rows - here @ solved, self._covariance(here)
+        return rows - (here.T @ solved).reshape(rows.shape), self._covariance(here)
 
     def covariance(self, focal):
         """Posterior covariance, with what the waves are too long for.
@@ -510,21 +530,23 @@ class Field:
         (2, 2, N) ndarray
             Px^2 of the focal plane.
         """
-        return self._covariance(self.basis.design(focal, self.spectrum.kind) * self._prior_root)
+        return self._covariance(self._scaled(focal))
 
     @property
     def wave(self):
         """Wave vectors ``(2, M)``, rad / px."""
         return self.basis.wave
 
-    @property
-    def _prior_root(self):
-        return np.sqrt(self.spectrum.prior(self.basis))
+    def _scaled(self, focal):
+        """Shapes in units of their prior, both axes side by side, ``(M, 2 N)``."""
+        shapes = self.basis.shapes(focal, self.spectrum.kind)
+        root = np.sqrt(self.spectrum.prior(self.basis))
+        return shapes.reshape(len(shapes), -1) * root[:, None]
 
     def _covariance(self, scaled):
-        """Covariance at the rows of a design in units of the prior."""
-        half = lapack.dtrtrs(self.root, scaled.reshape(-1, scaled.shape[2]).T, lower=1)[0]
-        half = half.reshape(-1, 2, scaled.shape[1])
+        """Covariance at places with these shapes, in units of the prior."""
+        half = lapack.dtrtrs(self.root, scaled, lower=1)[0]
+        half = half.reshape(len(half), 2, -1)
         covariance = np.einsum("man,mbn->abn", half, half)
         covariance[[0, 1], [0, 1]] += self.spectrum.unresolved(self.basis)
         return covariance
@@ -548,15 +570,16 @@ def fit_field(basis, spectrum, focal, residual, variance):
         Mean and covariance.
     """
     weight = 1.0 / (variance + spectrum.unresolved(basis))
-    design = basis.design(focal, spectrum.kind)
     root = np.sqrt(spectrum.prior(basis))
-    rows = design.reshape(-1, design.shape[2]) * root
-    heavy = rows * weight.reshape(-1, 1)
-    inner = heavy.T @ rows
+    shapes = basis.shapes(focal, spectrum.kind)
+    shapes = shapes.reshape(len(shapes), -1)
+    shapes *= root[:, None]
+    shapes *= np.sqrt(weight.ravel())
+    inner = shapes @ shapes.T
     inner[np.diag_indices_from(inner)] += 1.0
-    factor = cho_factor(inner, lower=True, check_finite=False)
-    coefficients = root * cho_solve(factor, heavy.T @ residual.ravel(), check_finite=False)
-    lower = np.tril(factor[0])
+    lower, _ = lapack.dpotrf(inner, lower=1, clean=1)
+    right = shapes @ (np.sqrt(weight) * residual).ravel()
+    coefficients = root * lapack.dpotrs(lower, right, lower=1)[0]
     inverse, _ = lapack.dtrtri(lower, lower=1)
     freedom = (len(root) - np.sum(inverse**2)) / max(focal.shape[1], 1)
     # A camera has a thousand of these, and no error is known to seven digits.

@@ -138,7 +138,7 @@ def undistorted(model, k, detector, x, y):
         c = model.coefficients[term.name]
         c = c if term.scope == "camera" else c[k]
         if np.any(c):
-            focal = focal + term.design(b) @ c
+            focal = focal + term.displacement(b, c)
     return focal + model.statics[k](place) if k in model.statics else focal
 
 
@@ -158,7 +158,8 @@ def colored(model, exposure, b):
     for term in model.terms:
         if term.chromatic:
             c = model.coefficients[term.name]
-            total = total + term.design(b) @ (c if term.scope == "camera" else c[exposure])
+            c = c if term.scope == "camera" else c[exposure]
+            total = total + term.displacement(b, c)
     return total
 
 

@@ -14,9 +14,16 @@ grow linearly with it.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, lapack
+from scipy.linalg import lapack
 
-__all__ = ["Blocks", "Posterior", "accumulate", "frame_equations", "invert", "posterior"]
+__all__ = [
+    "Blocks",
+    "Posterior",
+    "accumulate",
+    "frame_equations",
+    "invert",
+    "posterior",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +60,9 @@ def frame_equations(design, residual, weight, *, field=None):
         Columns of the unknowns.
     residual, weight : (2, N) ndarray
         Residuals and inverse variances, px.
-    field : (basis, prior), optional
-        Design ``(2, N, M)`` and prior variances ``(M,)`` of the frame's field, which is
-        marginalized: the noise covariance becomes diag(1 / weight) + basis prior basis^T.
+    field : (shapes, prior), optional
+        Shapes ``(M, 2, N)`` and prior variances ``(M,)`` of the frame's field, which is
+        marginalized: the noise covariance becomes diag(1 / weight) + shapes^T prior shapes.
 
     Returns
     -------
@@ -63,24 +70,19 @@ def frame_equations(design, residual, weight, *, field=None):
         Normal matrix and right-hand side.
     """
     n = design.shape[2]
-    rows = design.reshape(-1, n)
-    w = weight.ravel()
-    weighted = rows * w[:, None]
-    both = np.column_stack([rows, residual.ravel()])
-    products = weighted.T @ both
-    matrix, right = products[:, :n], products[:, n]
+    root = np.sqrt(weight.ravel())
+    both = np.vstack([np.moveaxis(design, -1, 0).reshape(n, -1), residual.ravel()]) * root
+    products = both @ both.T
     if field is not None:
-        basis, prior = field
-        basis = basis.reshape(-1, basis.shape[2])
-        heavy = basis * w[:, None]
-        root = np.sqrt(prior)
-        inner = (basis.T @ heavy) * root[:, None] * root
+        shapes, prior = field
+        heavy = shapes.reshape(len(shapes), -1) * np.sqrt(prior)[:, None]
+        heavy *= root
+        inner = heavy @ heavy.T
         inner[np.diag_indices_from(inner)] += 1.0
-        cross = (heavy.T @ both) * root[:, None]
-        solved = cho_solve(cho_factor(inner, lower=True, check_finite=False), cross)
-        correction = cross[:, :n].T @ solved
-        matrix, right = matrix - correction[:, :n], right - correction[:, n]
-    return matrix, right
+        factor, _ = lapack.dpotrf(inner, lower=1)
+        half, _ = lapack.dtrtrs(factor, heavy @ both.T, lower=1)
+        products = products - half.T @ half
+    return products[:n, :n], products[:n, n]
 
 
 def invert(matrix):

@@ -7,6 +7,7 @@ import numpy as np
 from wpdc_gwcs.fitting import WPDCFitter, fit_attitude, robust_sigma
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 from wpdc_gwcs.solution import DistortionSolution, covariance_of
+from wpdc_gwcs.solve.errors import extrapolation
 from wpdc_gwcs.solve.exposure import ExposureFit
 from wpdc_gwcs.solve.geometry import mean_direction
 from wpdc_gwcs.solve.model import block, colored, undistorted
@@ -110,8 +111,22 @@ def _instrument_sigma(o, state, frame, x, y, table_sigma):
     """Uncertainty of what the exposures share, without what their attitudes take, on a grid."""
     n = int(np.sqrt(len(x)))
     table = None if table_sigma is None else covariance_of(table_sigma.reshape(3, -1))
-    covariance = predict_variance(o, state, frame, x, y, table=table, instrument_only=True)
+    growth = _growth(o, state, int(o.detector_of[frame]), x, y)
+    covariance = predict_variance(
+        o, state, frame, x, y, table=table, growth=growth, instrument_only=True
+    )
     return sigma_grid(covariance, n)
+
+
+def _growth(o, state, k, x, y):
+    """Factors of the errors of a detector's distortion for the distance to the stars behind it."""
+    detector = o.detectors[k]
+    behind = np.zeros(len(o), bool)
+    for f in state.active:
+        if o.detector_of[f] == k:
+            behind[o.slices[f]] = state.kept[o.slices[f]]
+    stars = detector.normalized(o.x[behind], o.y[behind])
+    return extrapolation(np.array(stars), np.array(detector.normalized(x, y)))
 
 
 def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places):
@@ -133,7 +148,8 @@ def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places):
     table_sigma : (3, n, n) ndarray or None
         Uncertainty of the smoothed table, or of a stored solution.
     places : dict
-        Undistorted positions of grids, which all frames of a detector have in common.
+        Undistorted positions of grids, and what is known of the distance to the stars, which all
+        frames of a detector have in common.
 
     Returns
     -------
@@ -168,7 +184,10 @@ def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places):
     table = None
     if table_sigma is not None:
         table = replace(solution, table_sigma=table_sigma).covariance(gx, gy)
-    covariance = predict_variance(o, state, f, gx, gy, table=table)
+    key = (detector.name, "growth")
+    if key not in places:
+        places[key] = _growth(o, state, k, gx, gy)
+    covariance = predict_variance(o, state, f, gx, gy, table=table, growth=places[key])
     if field is None:
         covariance = covariance + left[:, None] * left
     sigma = sigma_grid(covariance, N_SIGMA)

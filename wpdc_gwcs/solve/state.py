@@ -130,7 +130,7 @@ def _products(o, state):
         marginal = None
         if spectrum is not None:
             basis = state.bases[k]
-            marginal = basis.design(focal[:, kept], spectrum.kind), spectrum.prior(basis)
+            marginal = basis.shapes(focal[:, kept], spectrum.kind), spectrum.prior(basis)
         yield k, e, *frame_equations(rows, -residual[:, kept], 1.0 / variance, field=marginal)
 
 
@@ -226,7 +226,7 @@ def _inflated(scopes, sigma, found):
             place += t.size
             if t.decay:
                 known = np.bincount(t.groups, np.sum(1.0 - mine, axis=0), len(t.start))
-                out[t.name] = sigma[t.name] * inflation(known)
+                out[t.name] = sigma[t.name] * inflation(known, len(variance))
     return out
 
 
@@ -415,7 +415,7 @@ def with_error_models(o, state):
     return replace(state, sigma=sigma, error_models=models)
 
 
-def predict_variance(o, state, frame, x, y, *, table=None, instrument_only=False):
+def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrument_only=False):
     """Covariance of the calibrated position of pixels of a frame, without centroid errors.
 
     Parameters
@@ -431,6 +431,8 @@ def predict_variance(o, state, frame, x, y, *, table=None, instrument_only=False
     table : (2, 2, N) ndarray, optional
         Covariance of the look-up table: where it is larger than that of the shared terms, it takes
         their place, for both describe the same surface.
+    growth : (N,) ndarray, optional
+        Factors of the standard deviations of the shared terms, see `extrapolation`.
     instrument_only : bool, optional
         Leave out the exposure's own numbers and field.
 
@@ -470,6 +472,8 @@ def predict_variance(o, state, frame, x, y, *, table=None, instrument_only=False
         return np.einsum("ia,abn,jb->ijn", inverse, matrix, inverse)
 
     instrument = turned(instrument)
+    if growth is not None:
+        instrument = growth**2 * instrument
     if table is not None:
         larger = table[0, 0] + table[1, 1] > instrument[0, 0] + instrument[1, 1]
         instrument = np.where(larger, table, instrument)

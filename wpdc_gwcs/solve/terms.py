@@ -1,6 +1,6 @@
 """The terms of a solution: linear displacements of the focal plane, with priors that are learnt.
 
-A term is plain data: a name, a scope, the columns of its design and the group of each.  The solver
+A term is plain data: a name, a scope, its shapes and the group of each coefficient.  The solver
 knows scopes (camera, detector, exposure) and groups, not names: a new term is one more function
 that returns a `Term`.  Displacements are in px of the focal plane, along its axes.
 """
@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 
 __all__ = [
     "Block",
@@ -64,8 +63,12 @@ class Term:
     decay : float
         Factor by which a group is expected to be smaller than the one before, where there is a
         sequence of them (degrees); 0 for groups of their own.
-    design : callable
-        ``design(block) -> (2, N, K)``.
+    shapes : callable
+        ``shapes(block) -> (p, N)``, functions of the place that displacements along both axes are
+        made of.
+    mix : (2 p, K) ndarray or None
+        What each coefficient gives of each shape, along the first axis and then along the second;
+        `None` for a coefficient of each.
     chromatic : bool, optional
         Whether it vanishes at the reference color.
     """
@@ -75,13 +78,54 @@ class Term:
     groups: np.ndarray
     start: np.ndarray
     decay: float
-    design: Callable
+    shapes: Callable
+    mix: np.ndarray | None = None
     chromatic: bool = False
 
     @property
     def size(self):
         """Number of coefficients."""
         return len(self.groups)
+
+    def displacement(self, block, coefficients):
+        """Displacements by known coefficients.
+
+        Parameters
+        ----------
+        block : Block
+            Stars.
+        coefficients : (K,) ndarray
+            Px.
+
+        Returns
+        -------
+        (2, N) ndarray
+            Px of the focal plane.
+        """
+        shapes = self.shapes(block)
+        each = coefficients if self.mix is None else self.mix @ coefficients
+        return each.reshape(2, -1) @ shapes
+
+    def design(self, block):
+        """Displacements of unit coefficients.
+
+        Parameters
+        ----------
+        block : Block
+            Stars.
+
+        Returns
+        -------
+        (2, N, K) ndarray
+            Px of the focal plane.
+        """
+        shapes = self.shapes(block)
+        p, n = shapes.shape
+        each = np.zeros((2 * p, 2, n))
+        each[:p, 0] = each[p:, 1] = shapes
+        if self.mix is not None:
+            each = (self.mix.T @ each.reshape(2 * p, -1)).reshape(-1, 2, n)
+        return np.moveaxis(each, 0, -1)
 
 
 # How much smaller a degree of a polynomial is expected to be than the degree before it.
@@ -100,24 +144,31 @@ def _degrees(first, last):
 
 
 def _legendre(a, b, first, last, aspect=(1.0, 1.0)):
-    """Products of Legendre polynomials of the total degrees first to last, ``(N, p)``.
+    """Products of Legendre polynomials of the total degrees first to last, ``(p, N)``.
 
-    Along a short side a polynomial of the same curvature is smaller: columns are scaled by the
-    sides, so that one variance serves all columns of a degree.
+    One variance is to serve all shapes of a degree.  Those of one degree have the same mean square
+    over the detector, as in a field that is the same everywhere: with equal coefficients, mixed
+    terms would be smaller than they are in lenses, and the middle calmer than the rim.  Along a
+    short side a polynomial of the same curvature is smaller: shapes are scaled by the sides.
     """
+    p, q = (_normalized(c, last, side) for c, side in zip((a, b), aspect))
+    degrees = _degrees(first, last)
+    out = np.empty((len(degrees), len(a)))
+    orders = [(n - j, j) for n in range(first, last + 1) for j in range(n + 1)]
+    for row, (i, j) in enumerate(orders):
+        np.multiply(p[i], q[j], out=out[row])
+    out /= np.sqrt(2 * degrees + 1)[:, None]
+    return out
+
+
+def _normalized(a, last, side):
+    """Legendre polynomials of the same mean square, those of a short side scaled, ``(n, N)``."""
+    out = np.ones((last + 1, len(a)))
+    out[1] = a
+    for n in range(2, last + 1):
+        out[n] = ((2 * n - 1) * a * out[n - 1] - (n - 1) * out[n - 2]) / n
     degrees = np.arange(last + 1)
-    p, q = legvander(a, last) * aspect[0] ** degrees, legvander(b, last) * aspect[1] ** degrees
-    return np.stack(
-        [p[:, n - j] * q[:, j] for n in range(first, last + 1) for j in range(n + 1)], axis=1
-    )
-
-
-def _both_axes(columns):
-    """Repeat columns for each axis by itself, ``(2, N, 2 p)``."""
-    n, p = columns.shape
-    out = np.zeros((2, n, 2 * p))
-    out[0, :, :p] = columns
-    out[1, :, p:] = columns
+    out *= (np.sqrt(2 * degrees + 1) * side**degrees)[:, None]
     return out
 
 
@@ -140,8 +191,9 @@ def polynomial(degree, *, mosaic=False):
     degrees = np.tile(_degrees(2, degree), 2)
     start = (_START_MOSAIC if mosaic else _START) / _DECAY ** (np.arange(2, degree + 1) - 2.0)
     # Of the second degree, a detector of a mosaic has its keystone apart, see `tilt`.
-    mix = np.eye(len(degrees))
+    mix = None
     if mosaic:
+        mix = np.eye(len(degrees))
         rest, second = _keystone()[:, 2:], np.flatnonzero(degrees == 2)
         higher = mix[:, degrees > 2]
         mix = np.zeros((len(degrees), rest.shape[1] + higher.shape[1]))
@@ -154,7 +206,8 @@ def polynomial(degree, *, mosaic=False):
         degrees - 2,
         start,
         _DECAY,
-        lambda b: _both_axes(_legendre(b.u, b.v, 2, degree, b.aspect)) @ mix,
+        lambda b: _legendre(b.u, b.v, 2, degree, b.aspect),
+        mix,
     )
 
 
@@ -162,13 +215,14 @@ def _keystone():
     """Orthogonal combinations of the six columns of degree 2: two keystones, and the other four.
 
     A keystone of one direction is (p^2, p q), of the other (p q, q^2); less constants, which a
-    shift takes, p^2 is two thirds of the Legendre polynomial.
+    shift takes, p^2 is two thirds of the Legendre polynomial.  See `_legendre` for the factors.
     """
     columns = np.zeros((6, 6))
-    columns[[0, 4], 0] = 2 / 3, 1
-    columns[[1, 5], 1] = 1, 2 / 3
-    columns[[0, 4], 2] = 1, -2 / 3
-    columns[[1, 5], 3] = 2 / 3, -1
+    square, mixed = 2 / 3, np.sqrt(5) / 3
+    columns[[0, 4], 0] = square, mixed
+    columns[[1, 5], 1] = mixed, square
+    columns[[0, 4], 2] = mixed, -square
+    columns[[1, 5], 3] = square, -mixed
     columns[2, 4] = columns[3, 5] = 1
     return columns / np.linalg.norm(columns, axis=0)
 
@@ -182,19 +236,22 @@ def place():
         Columns shift x, shift y, rotation, scale, stretch, shear; the last three vary less from
         detector to detector than the first three.
     """
-
-    def design(b):
-        zero, one = np.zeros_like(b.u), np.ones_like(b.u)
-        p, q = b.aspect[0] * b.u, b.aspect[1] * b.v
-        return np.array(
-            [
-                np.stack([one, zero, -q, p, p, q], axis=1),
-                np.stack([zero, one, p, q, -q, p], axis=1),
-            ]
-        )
-
-    return Term("place", "detector", np.array([0, 0, 1, 2, 3, 3]), np.full(4, _START_PLACE), 0.0,
-                design)  # fmt: skip
+    # 1, p, q along the first axis, then along the second.
+    mix = np.zeros((6, 6))
+    mix[[0, 3], [0, 1]] = 1
+    mix[2, 2], mix[4, 2] = -1, 1
+    mix[1, 3], mix[5, 3] = 1, 1
+    mix[1, 4], mix[5, 4] = 1, -1
+    mix[2, 5], mix[4, 5] = 1, 1
+    return Term(
+        "place",
+        "detector",
+        np.array([0, 0, 1, 2, 3, 3]),
+        np.full(4, _START_PLACE),
+        0.0,
+        lambda b: np.array([np.ones_like(b.u), b.aspect[0] * b.u, b.aspect[1] * b.v]),
+        mix,
+    )
 
 
 def tilt():
@@ -205,12 +262,15 @@ def tilt():
     Term
         One column for each direction.
     """
-    mix = _keystone()[:, :2]
-
-    def design(b):
-        return _both_axes(_legendre(b.u, b.v, 2, 2, b.aspect)) @ mix
-
-    return Term("tilt", "detector", np.zeros(2, int), np.array([1.0]), 0.0, design)
+    return Term(
+        "tilt",
+        "detector",
+        np.zeros(2, int),
+        np.array([1.0]),
+        0.0,
+        lambda b: _legendre(b.u, b.v, 2, 2, b.aspect),
+        _keystone()[:, :2],
+    )
 
 
 def optics(degree):
@@ -234,7 +294,7 @@ def optics(degree):
         np.tile(degrees - 2, 2),
         start,
         _DECAY,
-        lambda b: _both_axes(_legendre(*b.focal, 2, degree)),
+        lambda b: _legendre(*b.focal, 2, degree),
     )
 
 
@@ -246,11 +306,14 @@ def attitude():
     Term
         Columns (ax, bxx, bxy, ay, byx, byy), positions in units of the radius.
     """
-
-    def design(b):
-        return _both_axes(np.stack([np.ones_like(b.u), *b.focal], axis=1))
-
-    return Term("attitude", "exposure", np.zeros(6, int), np.array([1e4]), 0.0, design)
+    return Term(
+        "attitude",
+        "exposure",
+        np.zeros(6, int),
+        np.array([1e4]),
+        0.0,
+        lambda b: np.array([np.ones_like(b.u), *b.focal]),
+    )
 
 
 def refraction():
@@ -261,17 +324,13 @@ def refraction():
     Term
         One column for each axis, px per magnitude.
     """
-
-    def design(b):
-        return _both_axes(b.color[:, None])
-
     return Term(
         "refraction",
         "exposure",
         np.zeros(2, int),
         np.array([_START_COLOR]),
         0.0,
-        design,
+        lambda b: b.color[None],
         chromatic=True,
     )
 
@@ -285,17 +344,20 @@ def lateral_color():
         Radial columns of the first and third power, px per magnitude at the rim.
     """
 
-    def design(b):
+    def shapes(b):
         radial = b.color * b.focal
-        square = np.sum(b.focal**2, axis=0)
-        return np.stack([radial, radial * square], axis=2)
+        return np.concatenate([radial, radial * np.sum(b.focal**2, axis=0)])
 
+    # Along the first axis the first component of each power, along the second the second one.
+    mix = np.zeros((8, 2))
+    mix[[0, 5], 0] = mix[[2, 7], 1] = 1
     return Term(
         "lateral color",
         "camera",
         np.zeros(2, int),
         np.array([_START_COLOR]),
         0.0,
-        design,
+        shapes,
+        mix,
         chromatic=True,
     )

@@ -55,7 +55,7 @@ _MOST_ZOOMED = 60
 _MOST_STARS, _CELLS_PER_WAVE = 20_000, 16
 
 # Stars of which the columns are held in memory at once.
-_BLOCK = 4096
+_BLOCK = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +66,10 @@ class Waves:
     ----------
     center, size : (2,) ndarray
         Middle and sides of the detector's part of the focal plane, px.
-    wave : (2, M) ndarray
-        Wave vectors, rad / px.
+    orders : (2, M) ndarray of int
+        Wave vectors in units of the step.
+    step : (2,) ndarray
+        Rad / px.
     least_degree : int
         Of the polynomials; those below are in other terms.
     coefficients : (2, K) ndarray
@@ -80,7 +82,8 @@ class Waves:
 
     center: np.ndarray
     size: np.ndarray
-    wave: np.ndarray
+    orders: np.ndarray
+    step: np.ndarray
     least_degree: int
     coefficients: np.ndarray
     taken: np.ndarray
@@ -99,7 +102,7 @@ class Waves:
         (2, N) ndarray
             Px.
         """
-        return self.coefficients @ self._columns(focal).T
+        return self.coefficients @ self._shapes(focal)
 
     def covariance(self, focal):
         """Posterior covariance, the same along both axes, with what other terms make up for.
@@ -115,26 +118,38 @@ class Waves:
             Px^2.
         """
         free = _polynomials(self.center, self.size, focal, range(self.least_degree))
-        rows = self.half @ (self._columns(focal) - free @ self.taken).T
+        rows = self.half @ (self._shapes(focal) - self.taken.T @ free)
         out = np.zeros((2, 2, focal.shape[1]))
         out[0, 0] = out[1, 1] = np.sum(rows**2, axis=0)
         return out
 
-    def _columns(self, focal):
-        return _columns(self.center, self.size, self.wave, self.least_degree, focal)
+    @property
+    def wave(self):
+        """Wave vectors ``(2, M)``, rad / px."""
+        return self.orders * self.step[:, None]
+
+    def _shapes(self, focal):
+        return _shapes(self.center, self.size, self.orders, self.step, self.least_degree, focal)
 
 
-def _columns(center, size, wave, least_degree, focal):
-    """Cosines and sines, the polynomials of the higher degrees, and the rims."""
-    phase = (focal - center[:, None]).T @ wave
+def _shapes(center, size, orders, step, least_degree, focal):
+    """Cosines and sines, the polynomials of the higher degrees, and the rims, ``(K, N)``."""
+    # A wave along the plane is the product of waves along its axes.
+    reach = np.abs(orders).max(1)
+    along, across = (
+        np.exp(1j * np.outer(np.arange(-n, n + 1) * s, f))
+        for n, s, f in zip(reach, step, focal - center[:, None])
+    )
+    waves = along[orders[0] + reach[0]]
+    waves *= across[orders[1] + reach[1]]
     high = _polynomials(center, size, focal, range(least_degree, _DEGREE + 1))
-    return np.hstack([np.cos(phase), np.sin(phase), high, _rims(center, size, focal)])
+    return np.concatenate([waves.real, waves.imag, high, _rims(center, size, focal)])
 
 
 def _rims(center, size, focal):
     """Splines that are one at one side of the detector and zero at all other nodes."""
     node = (_NODES - 1) * ((focal - center[:, None]) / size[:, None] + 0.5)
-    return np.transpose([
+    return np.array([
         _OUTERMOST(np.clip(n, 0, _NODES - 1)) for along in node for n in (along, _NODES - 1 - along)
     ])  # fmt: skip
 
@@ -143,7 +158,7 @@ def _polynomials(center, size, focal, degrees):
     """Products of Legendre polynomials."""
     u, v = (legvander(m, _DEGREE).T for m in 2.0 * (focal - center[:, None]) / size[:, None])
     rows = [u[i] * v[n - i] for n in degrees for i in range(n + 1)]
-    return np.transpose(rows) if rows else np.zeros((focal.shape[1], 0))
+    return np.array(rows) if rows else np.zeros((0, focal.shape[1]))
 
 
 def candidates(low, high):
@@ -216,7 +231,7 @@ def fit_waves(low, high, focal, residual, variance):
     terms = np.cumsum(np.arange(_FREE_DEGREE + 1) + 1)
     least_degree = max(np.count_nonzero(terms * _STARS_PER_TERM <= focal.shape[1]), 2)
     for zoom in range(_ZOOMS + 1):
-        shape = center, size, orders * step[:, None], least_degree
+        shape = center, size, orders, step, least_degree
         normal, right, taken = _normal_equations(shape, focal, residual, weight)
         root, known = _learned(normal, right, orders.shape[1], _FLOOR / weight.sum())
         seen = np.flatnonzero(known > _SEEN)
@@ -256,13 +271,13 @@ def _normal_equations(shape, focal, residual, weight):
     for start in range(0, len(weight), _BLOCK):
         s = slice(start, start + _BLOCK)
         rows = [
-            _columns(*shape, focal[:, s]),
-            _polynomials(*shape[:2], focal[:, s], range(shape[3])),
-            residual[:, s].T,
+            _shapes(*shape, focal[:, s]),
+            _polynomials(*shape[:2], focal[:, s], range(shape[-1])),
+            residual[:, s],
         ]
-        rows = np.hstack(rows) * np.sqrt(weight[s, None])
-        total = total + rows.T @ rows
-    k, f = len(total) - 2, sum(range(shape[3] + 1))
+        rows = np.concatenate(rows) * np.sqrt(weight[s])
+        total = total + rows @ rows.T
+    k, f = len(total) - 2, sum(range(shape[-1] + 1))
     shapes, free = slice(k - f), slice(k - f, k)
     cross = total[free, shapes]
     solved = np.linalg.lstsq(total[free, free], np.hstack([cross, total[free, k:]]), rcond=1e-12)[0]
