@@ -8,7 +8,9 @@ from numpy.testing import assert_allclose
 from scipy.special import gamma, kv
 from scipy.stats import multivariate_normal
 
-from wpdc_gwcs.solve.field import Spectrum, fit_field, learn_spectra, patch, products
+from wpdc_gwcs.solve.basis import patch
+from wpdc_gwcs.solve.field import fit_field
+from wpdc_gwcs.solve.spectrum import Spectrum, learn_spectra, products
 
 LOW, HIGH = np.array([-1000.0, -600.0]), np.array([1000.0, 900.0])
 KINDS = ("curl-free", "axes")
@@ -227,6 +229,42 @@ class TestLearnSpectra:
         assert_allclose([s.amplitude for s in found.values()], 0.06, rtol=0.4)
         scales = [s.scale for s in found.values()]
         assert_allclose(np.exp(np.mean(np.log(scales))), 800.0, rtol=0.4)
+
+    @pytest.mark.parametrize("bend", [0.0, 0.1])
+    def test_polynomials_beside_the_waves(self, rng, bend):
+        """A saddle of random size along each axis, beside turbulence that is no gradient of it."""
+        truth, fine = Spectrum(0.03, 500.0), patch(LOW, HIGH, 150)
+        basis = patch(LOW, HIGH, 80, bends=True)
+        data = {}
+        for e in range(6):
+            focal, residual, weight = simulated(rng, truth, fine)
+            u, v = (focal - 0.5 * (LOW + HIGH)[:, None]) / (0.5 * (HIGH - LOW)[:, None])
+            a, b = bend * rng.normal(size=2)
+            data[e] = focal, residual + [a * u * v, b * (u**2 - v**2)], weight
+
+        def make(frame, kinds):
+            return products(basis, *data[frame], kinds=kinds)
+
+        found = learn_spectra({e: [e] for e in data}, make, start=0.02, scales=self.SCALES)
+        bends = np.array([s.bend for s in found.values()])
+        if not bend:
+            assert not bends.any()
+            return
+        assert np.sum(bends > 0.02) >= 4
+        focal, residual, weight = data[0]
+        at = places(rng, 400)
+        u, v = (at - 0.5 * (LOW + HIGH)[:, None]) / (0.5 * (HIGH - LOW)[:, None])
+        straight = Spectrum(0.05, 800.0)
+        fields = [
+            fit_field(basis, s, focal, residual, 1 / weight)(at) for s in (found[0], straight)
+        ]
+        rows = np.stack([np.ones_like(u), u, v, u * v, u**2, v**2], axis=1)
+        # What of it is bent as the residuals are.
+        bent = [np.linalg.lstsq(rows, f.T, rcond=None)[0][3:] for f in fields]
+        u, v = (focal - 0.5 * (LOW + HIGH)[:, None]) / (0.5 * (HIGH - LOW)[:, None])
+        rows = np.stack([np.ones_like(u), u, v, u * v, u**2, v**2], axis=1)
+        wanted = np.linalg.lstsq(rows, residual.T, rcond=None)[0][3:]
+        assert np.linalg.norm(bent[0] - wanted) < 0.8 * np.linalg.norm(bent[1] - wanted)
 
     def test_noise_is_no_field(self, rng):
         basis, nothing = patch(LOW, HIGH, 40), Spectrum(1e-12, 800.0)

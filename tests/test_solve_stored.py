@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from wpdc_gwcs import ResidualMap, detect_drift
 from wpdc_gwcs.models import deproject
 from wpdc_gwcs.solve import Exposure, solve
-from wpdc_gwcs.solve.field import Spectrum
+from wpdc_gwcs.solve.spectrum import Spectrum
 from wpdc_gwcs.solve.strength import summarize_fields
 
 SIDE = 1024

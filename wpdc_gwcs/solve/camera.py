@@ -217,10 +217,13 @@ def solve(
         state, infos = with_tables(o, state, group, n_grid, lut, choices=choices, draft=True)
         if any(table is not None for table in state.model.tables):
             state = with_error_models(o, _settled(o, state, clip, pool_attitudes))
+    # In a mosaic the neighbors' stars tell how an exposure bends; of an update it may be the
+    # instrument that does.
+    bends = len(o.detectors) == 1 and not update
     # Without a table there is nothing to write a field down in, unless it is asked for.
     if refine == "field" or (refine == "auto" and lut != "none"):
         for _ in range(_ROUNDS_FIELD):
-            state = with_spectra(o, state, force=refine == "field")
+            state = with_spectra(o, state, force=refine == "field", bends=bends)
             if not any(state.spectra.values()):
                 break
             state = linear_step(o, state, learn=_LEARN, pool=pool_attitudes)
@@ -457,7 +460,7 @@ def _updated(o, state, stored, group, n_grid, force):
     state = replace(state, model=model)
     if any(state.spectra.values()):
         # What the fields had taken of a change is the instrument's now.
-        state = linear_step(o, with_spectra(o, state, force=force), learn=1)
+        state = linear_step(o, with_spectra(o, state, force=force, bends=False), learn=1)
     return state, stored, infos
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from scipy.linalg import lapack
 from scipy.optimize import minimize
 
-from wpdc_gwcs.solve.field import Basis, Spectrum, patch
+from wpdc_gwcs.solve.basis import Basis, patch
 from wpdc_gwcs.solve.model import focal_variance, residuals
+from wpdc_gwcs.solve.spectrum import Spectrum
 from wpdc_gwcs.solve.strength import FieldPrior, log_strength
 
 __all__ = ["AGAINST_CHANGE", "POINTS", "Change", "find_change"]

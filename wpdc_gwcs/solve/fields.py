@@ -4,15 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from wpdc_gwcs.solve.field import (
-    Basis,
-    fit_field,
-    learn_spectra,
-    patch,
-    pooled_spectrum,
-    products,
-)
+from wpdc_gwcs.solve.basis import Basis, patch
+from wpdc_gwcs.solve.field import fit_field
 from wpdc_gwcs.solve.model import block, design, focal_variance, residuals
+from wpdc_gwcs.solve.spectrum import learn_spectra, pooled_spectrum, products
 from wpdc_gwcs.solve.surface import SummedField, of_field
 from wpdc_gwcs.solve.waves import fit_waves
 
@@ -63,7 +58,7 @@ def _margin(o):
     return _MARGIN if len(o.detectors) > 1 else 0.0
 
 
-def with_spectra(o, state, *, force=False):
+def with_spectra(o, state, *, force=False, bends=True):
     """State with waves for each detector and a spectrum for each exposure.
 
     Parameters
@@ -74,6 +69,8 @@ def with_spectra(o, state, *, force=False):
         Where the solution stands; its fields are not looked at.
     force : bool, optional
         Give every exposure a field, whatever the evidence.
+    bends : bool, optional
+        Whether exposures may have polynomials beside the waves.
 
     Returns
     -------
@@ -85,7 +82,7 @@ def with_spectra(o, state, *, force=False):
     for k in range(len(o.detectors)):
         mine = counts[(o.detector_of == k)]
         n = int(np.clip(np.median(mine) / _STARS_PER_WAVE_MARGINAL, 12, _MOST_MARGINAL))
-        bases[k] = patch(*_box(o, state, k, 0.3 * _margin(o)), n)
+        bases[k] = patch(*_box(o, state, k, 0.3 * _margin(o)), n, bends=bends)
     groups = {}
     for f in state.active:
         if counts[f] > 0:
@@ -163,10 +160,10 @@ def with_fields(o, state):
             low, high = _box(o, state, int(o.detector_of[f]), _margin(o))
             near = np.all((focal > low[:, None]) & (focal < high[:, None]), axis=0)
             n = int(np.clip(near.sum() / _STARS_PER_WAVE, 12, _MOST_FINAL))
+            basis = patch(low, high, n, bends=spectrum.bend > 0)
             fields[f] = fit_field(
-                patch(low, high, n), spectrum, focal[:, near], residual[:, near],
-                variance[:, near],
-            )  # fmt: skip
+                basis, spectrum, focal[:, near], residual[:, near], variance[:, near]
+            )
     return replace(state, model=state.model.with_fields(fields))
 
 

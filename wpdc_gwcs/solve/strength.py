@@ -9,6 +9,10 @@ __all__ = ["FieldPrior", "log_strength", "summarize_fields"]
 _LOG_STRENGTH, _GUESS_WEIGHT = 1.0, 0.5
 _LEAST_STRENGTH = 0.1
 
+# Amplitude of turbulence that bends a detector as polynomials of unit coefficients do, which it may
+# have been split into.
+_AMPLITUDE_OF_BEND = 1.7
+
 # Scatter of the logarithms of an outer scale, and of a strength that no solution tells.
 _LOG_SCALE, _LOG_UNKNOWN = 0.7, 1.5
 
@@ -69,6 +73,10 @@ def log_strength(amplitude, scale, wavelength):
     return amplitude + scale - 11 / 12 * np.log1p((np.exp(scale) / wavelength) ** 2)
 
 
+def _log_amplitude(spectrum):
+    return np.log(np.hypot(spectrum.amplitude, _AMPLITUDE_OF_BEND * spectrum.bend))
+
+
 def summarize_fields(spectra, image_shape, previous=None):
     """Typical field of some exposures, for the updates to come.
 
@@ -96,7 +104,7 @@ def summarize_fields(spectra, image_shape, previous=None):
         scale = np.mean([np.log(s.scale) for s in found])
         wavelength = 0.5 * max(image_shape)
         strengths = np.array(
-            [log_strength(np.log(s.amplitude), np.log(s.scale), wavelength) for s in found]
+            [log_strength(_log_amplitude(s), np.log(s.scale), wavelength) for s in found]
         )
         square = guess + np.sum((strengths - strengths.mean()) ** 2)
         own = {

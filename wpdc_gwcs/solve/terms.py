@@ -15,6 +15,7 @@ __all__ = [
     "Term",
     "attitude",
     "lateral_color",
+    "legendre_products",
     "optics",
     "place",
     "polynomial",
@@ -143,9 +144,25 @@ def _degrees(first, last):
     return np.array([n for n in range(first, last + 1) for _ in range(n + 1)])
 
 
-def _legendre(a, b, first, last, aspect=(1.0, 1.0)):
-    """Products of Legendre polynomials of the total degrees first to last, ``(p, N)``.
+def legendre_products(a, b, first, last, aspect=(1.0, 1.0)):
+    """Products of Legendre polynomials of the total degrees first to last.
 
+    Parameters
+    ----------
+    a, b : (N,) ndarray
+        Place, -1 to 1 along each side.
+    first, last : int
+        Total degrees.
+    aspect : (2,) array_like, optional
+        Sides in units of the longer one.
+
+    Returns
+    -------
+    (p, N) ndarray
+        Degree by degree, powers of ``b`` growing.
+
+    Notes
+    -----
     One variance is to serve all shapes of a degree.  Those of one degree have the same mean square
     over the detector, as in a field that is the same everywhere: with equal coefficients, mixed
     terms would be smaller than they are in lenses, and the middle calmer than the rim.  Along a
@@ -206,7 +223,7 @@ def polynomial(degree, *, mosaic=False):
         degrees - 2,
         start,
         _DECAY,
-        lambda b: _legendre(b.u, b.v, 2, degree, b.aspect),
+        lambda b: legendre_products(b.u, b.v, 2, degree, b.aspect),
         mix,
     )
 
@@ -215,7 +232,8 @@ def _keystone():
     """Orthogonal combinations of the six columns of degree 2: two keystones, and the other four.
 
     A keystone of one direction is (p^2, p q), of the other (p q, q^2); less constants, which a
-    shift takes, p^2 is two thirds of the Legendre polynomial.  See `_legendre` for the factors.
+    shift takes, p^2 is two thirds of the Legendre polynomial.  The other factors are those of
+    `legendre_products`.
     """
     columns = np.zeros((6, 6))
     square, mixed = 2 / 3, np.sqrt(5) / 3
@@ -268,7 +286,7 @@ def tilt():
         np.zeros(2, int),
         np.array([1.0]),
         0.0,
-        lambda b: _legendre(b.u, b.v, 2, 2, b.aspect),
+        lambda b: legendre_products(b.u, b.v, 2, 2, b.aspect),
         _keystone()[:, :2],
     )
 
@@ -294,7 +312,7 @@ def optics(degree):
         np.tile(degrees - 2, 2),
         start,
         _DECAY,
-        lambda b: _legendre(*b.focal, 2, degree),
+        lambda b: legendre_products(*b.focal, 2, degree),
     )
 
 

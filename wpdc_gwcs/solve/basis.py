@@ -1,0 +1,135 @@
+"""What fields are made of: sine waves on a patch of the focal plane, and a few polynomials."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wpdc_gwcs.solve.terms import legendre_products
+
+__all__ = ["BEND_DEGREES", "Basis", "patch"]
+
+# The patch is this much larger than the part of the focal plane where stars are used: the waves
+# vanish at its rim.
+_PATCH = 1.2
+
+# Degrees of the polynomials: what changes with focus, filter and flexure, and is no turbulence.
+BEND_DEGREES = (2, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Sine waves on a rectangle of the focal plane, and low polynomials where they are asked for.
+
+    Parameters
+    ----------
+    center, half : (2,) ndarray
+        Middle and half sides of the rectangle, px.
+    orders : (2, M) ndarray of int
+        Half waves along each axis, in the order of growing wave number.
+    bends : bool
+        Whether polynomials of degree 2 and 3 are part of it.
+    """
+
+    center: np.ndarray
+    half: np.ndarray
+    orders: np.ndarray
+    bends: bool = False
+
+    @property
+    def wave(self):
+        """Wave vectors ``(2, M)``, rad / px."""
+        return 0.5 * np.pi * self.orders / self.half[:, None]
+
+    def design(self, focal, kind="curl-free"):
+        """Displacements of unit coefficients, ``(2, N, K)``: K is M or 2 M, and 2, and 14 of bends.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+        kind : {'curl-free', 'axes'}, optional
+            Gradient of a potential, or each axis by itself.
+
+        Returns
+        -------
+        ndarray
+            Waves first, then polynomials, degree by degree along each axis; the last two columns
+            are a constant along each axis.
+        """
+        return np.moveaxis(self.shapes(focal, kind), 0, -1)
+
+    def shapes(self, focal, kind="curl-free"):
+        """Return `design` with the coefficients first, as it lies in memory: ``(K, 2, N)``.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+        kind : {'curl-free', 'axes'}, optional
+            Gradient of a potential, or each axis by itself.
+
+        Returns
+        -------
+        ndarray
+            In the same order.
+        """
+        phases = [
+            np.outer(
+                np.arange(self.orders[a].max() + 1),
+                (focal[a] - self.center[a] + self.half[a]) * (0.5 * np.pi / self.half[a]),
+            )
+            for a in range(2)
+        ]
+        m = self.orders.shape[1]
+        norm = 1.0 / np.sqrt(np.prod(self.half))
+        size = m if kind == "curl-free" else 2 * m
+        bends = self._bends(focal)
+        p = len(bends)
+        out = np.zeros((size + 2 * p + 2, 2, focal.shape[1]))
+        sines = [np.sin(phase) for phase in phases]
+        if kind == "curl-free":
+            wave = self.wave * norm
+            for a in range(2):
+                along = np.cos(phases[a])[self.orders[a]]
+                along *= wave[a][:, None]
+                np.multiply(along, sines[1 - a][self.orders[1 - a]], out=out[:m, a])
+        else:
+            first = sines[0][self.orders[0]]
+            first *= norm
+            np.multiply(first, sines[1][self.orders[1]], out=out[:m, 0])
+            out[m : 2 * m, 1] = out[:m, 0]
+        out[size : size + p, 0] = out[size + p : size + 2 * p, 1] = bends
+        out[-2, 0] = out[-1, 1] = 1.0
+        return out
+
+    def _bends(self, focal):
+        if not self.bends:
+            return np.zeros((0, focal.shape[1]))
+        place = (focal - self.center[:, None]) / (self.half[:, None] / _PATCH)
+        return legendre_products(*place, BEND_DEGREES[0], BEND_DEGREES[-1])
+
+
+def patch(low, high, n_waves, *, bends=False):
+    """Waves for the part of the focal plane between two corners.
+
+    Parameters
+    ----------
+    low, high : (2,) array_like
+        Corners, px.
+    n_waves : int
+        Waves to keep, the longest ones.
+    bends : bool, optional
+        Whether polynomials of degree 2 and 3 are to be part of it.
+
+    Returns
+    -------
+    Basis
+        On a rectangle that is a fifth larger.
+    """
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    half = 0.5 * _PATCH * (high - low)
+    # Enough orders along each axis that the shortest side does not run out of them.
+    reach = 2 * np.sqrt(n_waves / np.pi / np.prod(half)) * half * 1.3 + 2
+    j, k = (a.ravel() for a in np.meshgrid(*(np.arange(1, int(r) + 2) for r in reach)))
+    order = np.argsort((j / half[0]) ** 2 + (k / half[1]) ** 2, kind="stable")[:n_waves]
+    return Basis(0.5 * (low + high), half, np.array([j[order], k[order]]), bends)

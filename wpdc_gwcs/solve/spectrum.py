@@ -1,0 +1,382 @@
+"""The spectrum of the exposures' fields, by evidence.
+
+::
+
+    residuals, noise --products--> normal matrix of the waves
+                     --largest evidence--> amplitude s, outer scale L, stretch, bend
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import lapack
+from scipy.optimize import minimize
+
+from wpdc_gwcs.solve.basis import BEND_DEGREES, Basis
+
+__all__ = ["Products", "Spectrum", "learn_spectra", "pooled_spectrum", "products"]
+
+# Sum over the waves of a kind of field: a potential's gradient, or each axis by itself.
+KINDS = ("curl-free", "axes")
+
+# Prior of the spectrum of one exposure about the pooled one (natural logarithms), measured on
+# ground-based frames.
+_LOG_AMPLITUDE_SCATTER = 1.0
+_LOG_SCALE_SCATTER = 0.7
+_LOG_STRETCH_SCATTER = 0.5
+
+# Exposures, and frames of each, that the pooled spectrum is learnt from.
+_EXPOSURES_POOLED, _FRAMES_POOLED = 8, 2
+
+# Gain in log evidence that fields must bring to all exposures together, and what a stretch (two
+# numbers more) must add to one that is well above it.
+_LEAST_GAIN = 5.0
+_STRETCH_GAIN = 3.0
+_GAIN_FOR_STRETCH = 30.0
+
+# The same of polynomials beside the waves: much, for turbulence bends a detector as well, and where
+# exposures really bend, some of them bring 50 nats and more.  Their first guess in units of the
+# amplitude, and how much smaller a degree is than the one before.
+_BEND_GAIN, _FIRST_BEND, _BEND_DECAY = 10.0, 0.3, 1.8
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Power of a field: von Karman's, stretched along one direction, and polynomials.
+
+    Parameters
+    ----------
+    amplitude : float
+        Standard deviation along each axis, px.
+    scale : float
+        Outer scale, px.
+    stretch, angle : float
+        Ratio of the scales along and across a direction, and that direction in rad.
+    kind : {'curl-free', 'axes'}
+        Whether the displacements are the gradient of a potential.
+    bend : float
+        Standard deviation of the coefficients of degree 2 along each axis, px; 0 for none.
+    """
+
+    amplitude: float
+    scale: float
+    stretch: float = 1.0
+    angle: float = 0.0
+    kind: str = "curl-free"
+    bend: float = 0.0
+
+    def _reduced(self, wave):
+        """Square of the wave number over that of the outer scale, ``k^2 / k0^2``."""
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        along, across = c * wave[0] + s * wave[1], c * wave[1] - s * wave[0]
+        square = along**2 * self.stretch + across**2 / self.stretch
+        return square * (self.scale / (2 * np.pi)) ** 2
+
+    def prior(self, basis):
+        """Variance of each coefficient of a basis, the two constants last.
+
+        Parameters
+        ----------
+        basis : Basis
+            Waves.
+
+        Returns
+        -------
+        ndarray
+            For the columns of ``basis.design(..., kind)``.
+        """
+        wave = basis.wave
+        k0 = 2 * np.pi / self.scale
+        # Both axes together; the integral of the spectrum over the plane is 2 amplitude^2.
+        power = self.amplitude**2 * (20 * np.pi / 3) / k0**2
+        power = power * (1 + self._reduced(wave)) ** (-11 / 6)
+        if self.kind == "curl-free":
+            power = power / np.sum(wave**2, axis=0)
+        else:
+            power = np.tile(0.5 * power, 2)
+        lowest = (0.25 * self.scale / basis.half.max()) ** 2
+        constant = self.amplitude**2 * (1 - (1 + lowest) ** (-5 / 6))
+        bends = [
+            self.bend**2 * _BEND_DECAY ** (-2.0 * (n - BEND_DEGREES[0]))
+            for n in BEND_DEGREES for _ in range(n + 1)
+        ] if basis.bends else []  # fmt: skip
+        return np.concatenate([power, bends, bends, [constant, constant]])
+
+    def unresolved(self, basis):
+        """Variance along each axis that the waves of a basis are too long for, px^2.
+
+        Parameters
+        ----------
+        basis : Basis
+            Waves.
+
+        Returns
+        -------
+        float
+            What remains as noise.
+        """
+        highest = np.max(np.sum(basis.wave**2, axis=0)) * (self.scale / (2 * np.pi)) ** 2
+        return self.amplitude**2 * (1 + highest) ** (-5 / 6)
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Weighted products of the waves of one patch: all that evidence needs of the stars.
+
+    Parameters
+    ----------
+    basis : Basis
+        Waves.
+    matrix, right : dict
+        For each kind of field, normal matrix and right-hand side.
+    n_stars : int
+        Stars behind them.
+    """
+
+    basis: Basis
+    matrix: dict
+    right: dict
+    n_stars: int
+
+    def log_evidence(self, spectrum):
+        """Logarithm of the evidence of a spectrum over that of no field.
+
+        Parameters
+        ----------
+        spectrum : Spectrum
+            Spectrum.
+
+        Returns
+        -------
+        float
+            In nats.
+        """
+        root = np.sqrt(spectrum.prior(self.basis))
+        inner = self.matrix[spectrum.kind] * root[:, None] * root
+        inner[np.diag_indices_from(inner)] += 1.0
+        factor, info = lapack.dpotrf(inner, lower=1, overwrite_a=1)
+        if info != 0:
+            return -np.inf
+        half, _ = lapack.dtrtrs(factor, self.right[spectrum.kind] * root, lower=1)
+        return float(0.5 * half @ half - np.sum(np.log(np.diagonal(factor))))
+
+
+def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
+    """Multiply the waves of a patch with the residuals of its stars.
+
+    Parameters
+    ----------
+    basis : Basis
+        Waves.
+    focal, residual, weight : (2, N) ndarray
+        Places, residuals (px) and inverse variances of the stars.
+    nuisance : (2, N, K) ndarray, optional
+        Columns fitted freely beside the field: the attitude of a single detector.
+    kinds : tuple of str, optional
+        Kinds of field.
+
+    Returns
+    -------
+    Products
+        For `learn_spectra`.
+    """
+    matrix, right = {}, {}
+    w = weight.ravel()
+    r = residual.ravel()
+    for kind in kinds:
+        shapes = basis.shapes(focal, kind)
+        shapes = shapes.reshape(len(shapes), -1) * np.sqrt(w)
+        g, h = shapes @ shapes.T, shapes @ (np.sqrt(w) * r)
+        if nuisance is not None:
+            free = nuisance.reshape(-1, nuisance.shape[2])
+            cross = (shapes @ (free * np.sqrt(w)[:, None])).T
+            normal = (free * w[:, None]).T @ free
+            solved = np.linalg.lstsq(
+                normal, np.column_stack([cross, (free * w[:, None]).T @ r]), rcond=1e-12
+            )[0]
+            g = g - cross.T @ solved[:, :-1]
+            h = h - cross.T @ solved[:, -1]
+        matrix[kind], right[kind] = g, h
+    return Products(basis, matrix, right, focal.shape[1])
+
+
+def learn_spectra(frames, make, *, start, scales, force=False):
+    """Find the spectrum of each exposure by evidence, about one that all exposures share.
+
+    Parameters
+    ----------
+    frames : dict
+        Exposure to its frames.
+    make : callable
+        ``make(frame, kinds)`` returns the `Products` of a frame.
+    start : float
+        First guess of the amplitude, px.
+    scales : (float, float)
+        Least and largest outer scale, px.
+    force : bool, optional
+        Return a spectrum for every exposure, whatever the evidence.
+
+    Returns
+    -------
+    dict
+        Exposure to `Spectrum`, `None` for all where the stars do not speak for fields.
+
+    Notes
+    -----
+    Maximum a posteriori: the logarithms of amplitude and scale of an exposure scatter by 1 and 0.7
+    about the pooled ones.  A field that all exposures have in common, by evidence, is none of
+    theirs.
+    """
+    if not frames:
+        return {}
+    # A few frames tell what all have in common.
+    step = -(-len(frames) // _EXPOSURES_POOLED)
+    some = [f for e in sorted(frames)[::step] for f in frames[e][:_FRAMES_POOLED]]
+    patches = [make(f, KINDS) for f in some]
+    spectrum = pooled_spectrum(patches, start=start, scales=scales)
+    if spectrum is not None and _is_common(patches, spectrum):
+        spectrum = None
+    if spectrum is None and not force:
+        return dict.fromkeys(frames)
+    if spectrum is None:
+        spectrum = Spectrum(1e-3 * start, float(np.sqrt(np.prod(scales))))
+    found = {}
+    for e, members in frames.items():
+        group = [make(f, (spectrum.kind,)) for f in members]
+        # Where its own stars say little, an exposure is like the others; where they speak against
+        # a field, the amplitude is small.
+        found[e], _ = _maximize(group, spectrum.kind, start, scales, about=spectrum)
+    return found
+
+
+def _is_common(patches, spectrum):
+    """Tell whether all exposures of a detector have the same field: then it is the detector's."""
+    each = common = 0.0
+    for basis in {id(p.basis): p.basis for p in patches}.values():
+        mine = [p for p in patches if p.basis is basis]
+        if len(mine) > 1:
+            matrix, right = (
+                {spectrum.kind: sum(getattr(p, part)[spectrum.kind] for p in mine)}
+                for part in ("matrix", "right")
+            )
+            together = Products(basis, matrix, right, sum(p.n_stars for p in mine))
+            each += sum(p.log_evidence(spectrum) for p in mine)
+            common += together.log_evidence(spectrum)
+    return common > each
+
+
+def pooled_spectrum(patches, *, start, scales):
+    """Find the spectrum that several patches have in common.
+
+    Parameters
+    ----------
+    patches : list of Products
+        Stars of each, with all kinds of field.
+    start : float
+        First guess of the amplitude, px.
+    scales : (float, float)
+        Least and largest outer scale, px.
+
+    Returns
+    -------
+    Spectrum or None
+        `None` where the stars do not speak for a field.
+    """
+    straight = [_maximize(patches, kind, start, scales) for kind in KINDS]
+    spectrum, gain = max(straight, key=_gain)
+    if gain < _LEAST_GAIN:
+        return None
+    if patches[0].basis.bends:
+        bent = max((_bent(patches, each, scales) for each, _ in straight), key=_gain)
+        spectrum, _ = max((spectrum, gain + _BEND_GAIN), bent, key=_gain)
+    return spectrum
+
+
+def _maximize(group, kind, start, scales, about=None):
+    """Spectrum of the largest evidence (with the prior about another), and its gain in nats."""
+    low, high = np.log(scales)
+
+    def spectrum_of(p):
+        stretch, angle = (1.0, 0.0) if len(p) < 4 else (np.exp(np.hypot(p[2], p[3])),
+                                                        0.5 * np.arctan2(p[3], p[2]))  # fmt: skip
+        scale = np.exp(np.clip(p[1], low, high))
+        return Spectrum(float(np.exp(p[0])), float(scale), float(stretch), float(angle), kind)
+
+    def penalty(p):
+        beyond = max(low - p[1], p[1] - high, 0.0)
+        total = beyond**2
+        if about is not None:
+            total += _distance(p, about)
+        if len(p) == 4:
+            total += 0.5 * (p[2] ** 2 + p[3] ** 2) / _LOG_STRETCH_SCATTER**2
+        return total
+
+    def cost(p):
+        if not -25 < p[0] < 10:
+            return 1e12
+        spectrum = spectrum_of(p)
+        return penalty(p) - sum(g.log_evidence(spectrum) for g in group)
+
+    if about is not None:
+        p = np.log([about.amplitude, about.scale])
+    else:
+        trials = [
+            (np.log(start * a), np.clip(0.5 * (low + high) + b, low, high))
+            for a in (0.2, 1.0, 5.0)
+            for b in (-1.0, 0.0, 1.0)
+        ]
+        p = np.array(min(trials, key=cost))
+    found = minimize(cost, p, method="Nelder-Mead",
+                     options={"xatol": 0.02, "fatol": 0.05, "maxfev": 80,
+                              "initial_simplex": p + [[0, 0], [0.4, 0], [0, 0.4]]})  # fmt: skip
+    p, gain = found.x, -found.fun
+    if gain > _GAIN_FOR_STRETCH and kind == "curl-free":
+        p4 = np.array([*p, 0.0, 0.0])
+        steps = np.vstack([np.zeros(4), np.diag([0.2, 0.2, 0.5, 0.5])])
+        four = minimize(cost, p4, method="Nelder-Mead",
+                        options={"xatol": 0.03, "fatol": 0.1, "maxfev": 120,
+                                 "initial_simplex": p4 + steps})  # fmt: skip
+        if -four.fun > gain + _STRETCH_GAIN:
+            p, gain = four.x, -four.fun
+    found = spectrum_of(p)
+    if about is not None and about.bend:
+        return max((found, gain + _STRETCH_GAIN), _bent(group, found, scales, about), key=_gain)
+    return found, gain
+
+
+def _gain(found):
+    return found[1]
+
+
+def _distance(p, about):
+    """Minus the log prior of amplitude and scale of one exposure about those of all."""
+    return (
+        0.5 * ((p[0] - np.log(about.amplitude)) / _LOG_AMPLITUDE_SCATTER) ** 2
+        + 0.5 * ((p[1] - np.log(about.scale)) / _LOG_SCALE_SCATTER) ** 2
+    )
+
+
+def _bent(group, straight, scales, about=None):
+    """Spectrum of the largest evidence with polynomials beside the waves, and its gain in nats."""
+    low, high = np.log(scales)
+    first = about.bend if about is not None else _FIRST_BEND * straight.amplitude
+
+    def spectrum_of(p):
+        amplitude, scale, bend = np.exp([p[0], np.clip(p[1], low, high), p[2]])
+        return replace(straight, amplitude=float(amplitude), scale=float(scale), bend=float(bend))
+
+    def cost(p):
+        if np.any(p[[0, 2]] < -25) or np.any(p[[0, 2]] > 10):
+            return 1e12
+        total = max(low - p[1], p[1] - high, 0.0) ** 2
+        if about is not None:
+            total += _distance(p, about)
+            total += 0.5 * ((p[2] - np.log(about.bend)) / _LOG_AMPLITUDE_SCATTER) ** 2
+        spectrum = spectrum_of(p)
+        return total - sum(g.log_evidence(spectrum) for g in group)
+
+    p = np.log([straight.amplitude, straight.scale, first])
+    steps = np.vstack([np.zeros(3), np.diag([0.3, 0.3, 0.7])])
+    options = {"xatol": 0.03, "fatol": 0.1, "maxfev": 120, "initial_simplex": p + steps}
+    found = minimize(cost, p, method="Nelder-Mead", options=options)
+    return spectrum_of(found.x), -found.fun
