@@ -191,6 +191,25 @@ def test_stock_wcs_in_the_file(tmp_path, table):
         read(tmp_path / "stock.asdf")
 
 
+@pytest.mark.parametrize("table", [None, "linear", "cubic"])
+def test_files_satisfy_the_schemas_of_asdf(tmp_path, table):
+    # Which are not looked at when our files are written, but whenever they are read.
+    calibration = make_calibration(table=table)
+    write(calibration, tmp_path / "a.wcs.asdf")
+    write(calibration.solution, tmp_path / "a.solution.asdf")
+    write(calibration, tmp_path / "a.stock.asdf", format="stock")
+    with asdf.config_context() as config:
+        config.validate_on_read = True
+        for name in ("a.wcs.asdf", "a.solution.asdf", "a.stock.asdf"):
+            with asdf.open(tmp_path / name) as file:
+                file.validate()
+        content = (tmp_path / "a.wcs.asdf").read_bytes()
+        assert b"offset: -" in content
+        (tmp_path / "b.asdf").write_bytes(content.replace(b"offset: -", b"offset: x", 1))
+        with pytest.raises(asdf.ValidationError):
+            asdf.open(tmp_path / "b.asdf")
+
+
 def edited(path, tmp_path, edit):
     """A file with other values, and a sum that agrees with them."""
     with asdf.open(path, lazy_load=False, memmap=False) as file:
