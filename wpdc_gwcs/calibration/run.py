@@ -23,7 +23,14 @@ from wpdc_gwcs.calibration.summary import summarize, summary_row
 from wpdc_gwcs.calibration.workers import Task, Workers, internal_error, stored_of
 from wpdc_gwcs.camera import build_camera
 from wpdc_gwcs.catalogs import fill_motions, read_catalog, split_extension
-from wpdc_gwcs.exceptions import DuplicateFrameError, FitError, InternalError, MatchError, WPDCError
+from wpdc_gwcs.exceptions import (
+    ClusterError,
+    DuplicateFrameError,
+    FitError,
+    InternalError,
+    MatchError,
+    WPDCError,
+)
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.threads import one_blas_thread
 
@@ -128,6 +135,8 @@ def calibrate(
     InputError
         If the catalog cannot be used, a file cannot be written or may not be replaced, or a run
         of other choices is to be resumed.
+    ClusterError
+        If the executor has nobody left to do the work; what was done is written.
 
     Warns
     -----
@@ -174,7 +183,7 @@ def calibrate(
         todo = [group for group in groups if group[0].name not in outcomes]
         jobs = min(jobs, sum(map(len, todo)))
         with Workers(jobs, executor) as workers:
-            for group, outcome in zip(todo, _outcomes(todo, run, workers), strict=True):
+            for group, outcome in _outcomes(todo, run, workers):
                 outcomes[group[0].name] = outcome
                 for name, error in outcome.failures.items():
                     _log_details(name, error, folder)
@@ -218,31 +227,48 @@ class _Run:
 
 
 def _outcomes(groups, run, workers):
-    """Yield what is found of each group; those behind it are matched in the meantime."""
+    """Yield each group and what is found of it; those behind it are matched in the meantime.
+
+    Where a cluster is lost, what it had done already comes before the error.
+    """
     other = _of_other_detectors(run.frames, run.solution)
     submitted = [{} if other else _submit(group, run, workers, narrow=True) for group in groups]
     counter, n_frames = itertools.count(1), sum(map(len, groups))
     run.progress("match", 0, n_frames)
+    lost = None
     for k, group in enumerate(groups):
         # Taken away, so that what is done needs no memory any more.
         tasks, submitted[k] = submitted[k], None
         results = {frame.name: other[frame.name] for frame in group} if other else {}
-        for name in list(tasks):
-            results[name] = tasks.pop(name)()
-            run.progress("match", next(counter), n_frames)
-        run.progress("solve", k, len(groups))
         try:
-            if not other:
-                results = _match_group(group, results, run, workers)
-            outcome = _solve_group(group, results, run)
-        except Exception as problem:  # noqa: BLE001  One camera is not to end the run of all.
-            error = problem if isinstance(problem, WPDCError) else internal_error(problem)
-            outcome = Outcome(
-                failures={frame.name: error for frame in group},
-                rows=[summary_row(f, results[f.name], None, error, run.settings) for f in group],
-            )
-        yield outcome
+            for name in list(tasks):
+                results[name] = tasks.pop(name)()
+                run.progress("match", next(counter), n_frames)
+            run.progress("solve", k, len(groups))
+            outcome = _outcome_of(group, results, run, None if other else workers)
+        except ClusterError as err:
+            lost = err
+            continue
+        yield group, outcome
+    if lost is not None:
+        raise lost
     run.progress("solve", len(groups), len(groups))
+
+
+def _outcome_of(group, results, run, workers):
+    """Match what could not be matched alone, where there are workers for it, and solve."""
+    try:
+        if workers is not None:
+            results = _match_group(group, results, run, workers)
+        return _solve_group(group, results, run)
+    except ClusterError:
+        raise
+    except Exception as problem:  # noqa: BLE001  One camera is not to end the run of all.
+        error = problem if isinstance(problem, WPDCError) else internal_error(problem)
+        return Outcome(
+            failures={frame.name: error for frame in group},
+            rows=[summary_row(f, results[f.name], None, error, run.settings) for f in group],
+        )
 
 
 def _solve_group(group, results, run):
