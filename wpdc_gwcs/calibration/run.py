@@ -32,6 +32,7 @@ from wpdc_gwcs.exceptions import (
     WPDCError,
 )
 from wpdc_gwcs.frame import Frame
+from wpdc_gwcs.frozen import freeze_attributes
 from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["CalibrationRun", "calibrate"]
@@ -45,7 +46,7 @@ class CalibrationRun:
 
     Parameters
     ----------
-    calibrations : list of `Calibration`
+    calibrations : tuple of `Calibration`
         One for each solved frame, in the order of the input.
     solutions : dict
         Detector name to `DistortionSolution`.
@@ -55,7 +56,7 @@ class CalibrationRun:
         One row per frame: status, reason, counts, residual statistics, seconds.
     superseded : dict
         Detector name to the stored solution that an update has found changed, valid until then.
-    cameras : list of `Camera`
+    cameras : tuple of `Camera`
         One for each group of detectors that were solved together.
     run_id : str
         Identity of the run, which all files carry that it writes.
@@ -63,14 +64,18 @@ class CalibrationRun:
         Frames that an earlier run had done, whose results were read from its files.
     """
 
-    calibrations: list
+    calibrations: tuple
     solutions: dict
     failures: dict
     summary: QTable = field(repr=False)
     superseded: dict = field(default_factory=dict)
-    cameras: list = field(default_factory=list)
+    cameras: tuple = ()
     run_id: str = ""
     resumed: tuple = ()
+
+    def __post_init__(self):
+        names = ("calibrations", "solutions", "failures", "superseded", "cameras", "resumed")
+        freeze_attributes(self, *names)
 
 
 @one_blas_thread
