@@ -139,6 +139,7 @@ def read_wcstools(path, x, y):
 PERIOD = 4  # px, of the ramps that are resampled: their values tell where they come from
 
 
+_LARGEST = 4096  # px, of the images that are resampled by reproject, which takes its time
 _THINNED = 5  # reproject resamples every so many pixels
 
 
@@ -362,7 +363,8 @@ def main():
                 print(f"{form:8}" + "".join(map(cell, row)))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            into_images(obj)
+            if max(shape) <= _LARGEST:
+                into_images(obj)
             cutouts(obj)
 
 
