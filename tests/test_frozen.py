@@ -8,7 +8,7 @@ import pickle
 import numpy as np
 import pytest
 
-from wpdc_gwcs import Calibration, DistortionSolution, PVPolynomial
+from wpdc_gwcs import Calibration, DistortionSolution, LookupTable, PVPolynomial
 from wpdc_gwcs.camera import Camera
 from wpdc_gwcs.frozen import FrozenDict, freeze, frozen_array
 
@@ -54,6 +54,16 @@ def test_it_stays_frozen_on_its_way(way):
     again = way(frozen)
     assert again == frozen
     assert type(again) is type(again["a"]) is FrozenDict
+
+
+def test_nodes_of_a_table_are_read_only():
+    table = LookupTable(np.arange(4.0), np.arange(4.0), *np.zeros((2, 4, 4)))
+    for nodes in (table.x_grid, table.y_grid, table.dx, table.dy):
+        with pytest.raises(ValueError, match="read-only"):
+            nodes[0] = 1.0
+    # A model of astropy has parameters that can be set, as one.
+    table.displacement = np.ones((2, 4, 4))
+    assert table(1.0, 1.0) == (1.0, 1.0)
 
 
 def test_it_is_a_dictionary():

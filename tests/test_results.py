@@ -303,6 +303,11 @@ def test_a_process_that_dies_has_a_second_try(frames, inputs, tmp_path, once):
         assert message in str(run.failures[frames[0].name])
 
 
+def test_paths_are_no_frames(inputs):
+    with pytest.raises(TypeError, match="as read_frames gives, got PosixPath|WindowsPath|str"):
+        calibrate([inputs[0][0]], inputs[1])
+
+
 def test_frames_that_cannot_travel(frames, inputs):
     frames[0] = replace(frames[0], load_sources=lambda: None)
     run = calibrate(frames, inputs[1], jobs=2)

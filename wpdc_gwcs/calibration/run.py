@@ -135,6 +135,8 @@ def calibrate(
     ------
     DuplicateFrameError
         If two frames have the same name.
+    TypeError
+        If what is given is no frame, for example the path of one.
     ValueError
         If there is no frame.
     InputError
@@ -205,6 +207,10 @@ def _as_frames(frames):
         raise ValueError("calibrate needs at least one frame")
     seen = {}
     for frame in frames:
+        if not isinstance(frame, Frame):
+            raise TypeError(
+                f"frames must be Frame objects, as read_frames gives, got {type(frame).__name__}"
+            )
         if frame.name in seen:
             raise DuplicateFrameError(
                 f"frame names must be unique: {seen[frame.name].source} and {frame.source} would "
