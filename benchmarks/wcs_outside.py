@@ -150,13 +150,18 @@ def ramp(shape, axis):
     return np.broadcast_to(values % PERIOD, (ny, nx)).astype(np.int16)
 
 
-def error_of(values, place, axis, shape):
-    """Greatest difference of resampled values from those of the pixels they should come from."""
+def errors_of(values, place, axis, shape):
+    """Differences of resampled values from those of the pixels they should come from."""
     ny, nx = shape
     expected = place[axis] % PERIOD
     good = (expected > 0.5) & (expected < PERIOD - 1.5)
     good &= (place > 1).all(axis=0) & (place[0] < nx - 2) & (place[1] < ny - 2)
-    return float(np.abs(values - expected)[good].max())
+    return np.where(good, values - expected, np.nan)
+
+
+def greatest(errors):
+    """Greatest distance; `None` where nothing was resampled."""
+    return float(np.nanmax(np.hypot(*errors))) if errors else None
 
 
 def run_swarp(folder, name):
@@ -199,8 +204,8 @@ def read_swarp(obj, path):
             if path.suffix == ".head":
                 shutil.copy(path, folder / "a.head")
             values, sky = run_swarp(folder, "a.fits")
-            worst.append(error_of(values, np.array(obj.wcs.invert(*sky)), axis, shape))
-    return float(np.hypot(*worst))
+            worst.append(errors_of(values, np.array(obj.wcs.invert(*sky)), axis, shape))
+    return greatest(worst)
 
 
 def make_image(kind, path, image, header):
@@ -263,13 +268,12 @@ def into_images(obj):
                     same = "the same" if bytes_of_others(path, number) == before else "CHANGED"
                     if reproject_interp:
                         values, _ = reproject_interp(path, target, shape_out=thinned, hdu_in=number)
-                        found.append(error_of(values[v, u], place, axis, shape))
+                        found.append(errors_of(values[v, u], place, axis, shape))
                     if kind == "plain" and form == "tpv" and shutil.which("SWarp"):
                         values, sky = run_swarp(Path(folder), "a.fits")
                         at = np.array(obj.wcs.invert(*sky))
-                        swarp.append(error_of(values, at, axis, shape))
-            cells = [made.deviation, np.hypot(*found) if found else None]
-            cells += [made.swarp_deviation, np.hypot(*swarp) if swarp else None]
+                        swarp.append(errors_of(values, at, axis, shape))
+            cells = [made.deviation, greatest(found), made.swarp_deviation, greatest(swarp)]
             print(f"{kind:12}{form:12}" + "".join(map(cell, cells)) + f"  {same}")
 
 
