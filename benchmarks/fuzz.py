@@ -6,13 +6,17 @@ result, or with one line that begins ``wpdc: error:``; a WCS file that still ope
 same positions.  Run as ``python benchmarks/fuzz.py [CASES] [SEED]``.
 """
 
+import bz2
 import contextlib
 import faulthandler
+import gzip
 import io
+import lzma
 import os
 import re
 import shutil
 import signal
+import socket
 import sys
 import tempfile
 import time
@@ -218,13 +222,106 @@ def odd_table(path, rng):
     table.write(path, overwrite=True)
 
 
+# What nobody means, by what it is made of.
+ODD = {
+    "place": ["image", "table", "catalog", "header", "wcs", "fits", "solution", "config", "mask",
+              "weight-map"],
+    "archive": ["image", "catalog", "fits"],
+    "tree": ["wcs", "solution"],
+    "list": ["table"],
+}  # fmt: skip
+
+
+def odd_place(folder, name, rng):
+    """What is there and is no file of the kind: a folder, a pipe, a device, a link to itself."""
+    path = folder / f"odd-{name}.fits"
+    kind = str(rng.choice(["folder", "pipe", "socket", "loop", "nothing", "device", "endless"]))
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with contextlib.closing(socket.socket(socket.AF_UNIX)) as server:
+            server.bind(os.path.relpath(path))
+    elif kind in ("loop", "nothing"):
+        path.symlink_to(path if kind == "loop" else folder / "nothing")
+    else:
+        return Path("/dev/null" if kind == "device" else "/dev/zero")
+    return path
+
+
+def odd_archive(data, rng):
+    """Compressed once or twice, cut, with a wrong sum, or far larger than it looks."""
+    packed = gzip.compress(data)
+    return [
+        packed[: int(rng.integers(1, len(packed)))],
+        packed + b"more" * 100,
+        packed[:-8] + bytes(8),
+        gzip.compress(packed),
+        gzip.compress(b""),
+        gzip.compress(data[:5760] + bytes(100_000_000)),
+        bz2.compress(data)[: int(rng.integers(1, 5000))],
+        lzma.compress(data)[: int(rng.integers(1, 5000))],
+    ][int(rng.integers(8))]
+
+
+def odd_tree(data, rng):
+    """ASDF with tags, types, shapes and sources that are other ones."""
+    head, tree = data[: (at := data.index(b"\nwpdc:"))], data[at:]
+    old, new = [
+        (rb"datatype: float64", b"datatype: complex128"),
+        (rb"datatype: float64", b"datatype: [ascii, 9]"),
+        (rb"byteorder: little", b"byteorder: big"),
+        (rb"source: \d+", b"source: 99"),
+        (rb"source: \d+", b"source: -9"),
+        (rb"source: \d+", b"source: other.asdf"),
+        (rb"shape: \[\d+", b"shape: [-5"),
+        (rb"shape: \[\d+", b"shape: [999999999999"),
+        (rb"!core/ndarray-1.\d.0", b"!core/complex-1.0.0"),
+        (rb"!core/ndarray-1.\d.0", b"!!python/object/apply:os.system"),
+        (rb"\nwpdc:", b"\nwpdc: &w {wpdc: *w}\nother:"),
+        (rb"\nwpdc:", b"\nwpdc: {$ref: 'http://127.0.0.1:9/a'}\nother:"),
+        (rb"format_version: 1", b"format_version: 0"),
+    ][int(rng.integers(13))]
+    return head + re.sub(old, new, tree, count=1)
+
+
+def odd_config(rng):
+    """TOML that is none, or whose values are of other types."""
+    return [
+        b"r0 = [1, 2]", b"[r0]\na = 1", b"seed = 2020-01-01", b"seed = true", b"jobs = '2'",
+        b"a = " + b"[" * 3000, b"a = " + b"[" * 200 + b"]" * 200, b"seed = 1\nseed = 2",
+        b"\xff\xfe", b"\xef\xbb\xbfseed = 1", b"seed = " + b"9" * 5000, b"output = 5",
+        b"n-grid = 50.5", b"a.b.c = 1", b"mask-bits = 'x'", b"x = '" + b"a" * 10_000_000 + b"'",
+        b'detector = "\\u0000"', b"catalog = ['a', 'b']", b"min-snr = nan", b"frames = ['x']",
+    ][int(rng.integers(20))]  # fmt: skip
+
+
+def odd_list(data, rng):
+    """ECSV whose header says what no table is."""
+    old, new = [
+        (b"ECSV 1.0", b"ECSV 9.7"), (b"float64", b"floaty"), (b"float64", b"object"),
+        (b"float64", b"complex128"), (b"name: y", b"name: x"),
+        (b"# datatype:", b"# delimiter: '@@'\n# datatype:"),
+        (b"# datatype:", b"# meta: !!omap [1, 2]\n# datatype:"),
+        (b"# datatype:", b"# meta: !!python/object/apply:os.system [x]\n# datatype:"),
+        (b"# datatype:", b"# meta: " + b"[" * 5000 + b"\n# datatype:"),
+        (b"# datatype:", b"# meta: {__serialized_columns__: 5}\n# datatype:"),
+        (b"# -", b"#\t-"),
+    ][int(rng.integers(11))]  # fmt: skip
+    return data.replace(old, new) if rng.uniform() < 0.9 else data + b"1" * 10_000_000
+
+
+MAKE = {"archive": odd_archive, "tree": odd_tree, "list": odd_list}
+
+
 # --- cases --------------------------------------------------------------------------------------
 
 
 def cases(inputs, work, n, seed):
     """Kind, command, and whether its output must stay as it was."""
     rng = np.random.default_rng(seed)
-    kinds = [*DAMAGE, "odd image", "odd catalog", "option", "config"]
+    kinds = [*DAMAGE, "odd image", "odd catalog", "option", "config", *ODD]
     weights = np.array([3.0 if kind in ("wcs", "fits") else 1.0 for kind in kinds])
     for _ in range(n):
         kind = str(rng.choice(kinds, p=weights / weights.sum()))
@@ -243,6 +340,12 @@ def cases(inputs, work, n, seed):
             odd_image(copies["image"], rng)
         elif kind == "odd catalog":
             odd_table(copies["catalog"], rng)
+        elif kind in ("archive", "tree", "list"):
+            of = str(rng.choice(ODD[kind]))
+            copies[of].write_bytes(MAKE[kind](copies[of].read_bytes(), rng))
+        elif kind == "place":
+            of = str(rng.choice(ODD[kind]))
+            copies[of] = odd_place(work, of, rng)
         options = {
             "--catalog": copies["catalog"],
             "--output": work / "new",
@@ -250,7 +353,18 @@ def cases(inputs, work, n, seed):
         }
         frame = copies["ldac"]
         keeps = False
-        if kind in ("wcs", "fits", "cpdis", "solution"):
+        if kind in ODD:
+            # The damaged file is asked for by what reads such files.
+            frame = copies[of] if of in ("image", "table") else frame
+            options |= {f"--{of}": copies[of]} if of in ("catalog", "solution", "config") else {}
+            options |= {"--wcs": copies["header"]} if of in ("table", "header") else {}
+            frame = copies["table"] if of == "header" else frame
+            if of in ("mask", "weight-map"):
+                frame, options[f"--{of}"] = copies["image"], copies[of]
+            command = ["calibrate", frame]
+            if of in ("wcs", "fits"):
+                command, keeps = ["pix2sky", copies[of], "100.25", "71.5"], True
+        elif kind in ("wcs", "fits", "cpdis", "solution"):
             command, keeps = ["pix2sky", copies[kind], "100.25", "71.5"], True
         elif kind == "matches":
             command = ["evaluate", copies["folder"], "--no-weights"]
@@ -276,6 +390,8 @@ def cases(inputs, work, n, seed):
             options["--config"] = work / "c.toml"
             if rng.uniform() < 0.5:
                 options.pop(f"--{name}", None)
+            if rng.uniform() < 0.3:
+                (work / "c.toml").write_bytes(odd_config(rng))
         if command[0] == "calibrate":
             command += [str(x) for pair in options.items() for x in pair]
         yield kind, [str(x) for x in command], keeps

@@ -5,8 +5,10 @@ Run from the root of the project::
     python benchmarks/wcs_outside.py                  # made up, 40 and 200 px of distortion
     python benchmarks/wcs_outside.py a.wcs.asdf ...   # calibrations of one's own
 
-A reader that is not installed is left out: astropy and galsim, esutil, starlink-pyast (PyPI), and
-the programs SWarp, sky2xy and xy2sky (Debian: swarp, wcstools).
+What is printed stands beside what is found: ``swarp*`` is the deviation in SWarp that is told with
+``tpv`` and ``head``.  Images of three kinds get the WCS by ``--into``; then reproject and SWarp
+resample them.  A reader that is not installed is left out: astropy and galsim, esutil,
+starlink-pyast, reproject (PyPI), SWarp, sky2xy and xy2sky (Debian: swarp, wcstools).
 """
 
 import argparse
@@ -24,6 +26,7 @@ from astropy.wcs import WCS, WcsError
 
 from wpdc_gwcs import DistortionSolution, read
 from wpdc_gwcs.export import FORMS
+from wpdc_gwcs.io.embed import write_into
 from wpdc_gwcs.io.fits import write_form
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 
@@ -133,51 +136,150 @@ def read_wcstools(path, x, y):
     return np.array(rows, float).T if len(rows) == len(x) else None
 
 
+PERIOD = 4  # px, of the ramps that are resampled: their values tell where they come from
+
+
+_LARGEST = 4096  # px, of the images that are resampled by reproject, which takes its time
+_THINNED = 5  # reproject resamples every so many pixels
+
+
+def ramp(shape, axis):
+    """Image whose values are the pixels along an axis, over and over again."""
+    ny, nx = shape
+    values = np.arange(nx)[np.newaxis] if axis == 0 else np.arange(ny)[:, np.newaxis]
+    return np.broadcast_to(values % PERIOD, (ny, nx)).astype(np.int16)
+
+
+def errors_of(values, place, axis, shape):
+    """Differences of resampled values from those of the pixels they should come from."""
+    ny, nx = shape
+    expected = place[axis] % PERIOD
+    good = (expected > 0.5) & (expected < PERIOD - 1.5)
+    good &= (place > 1).all(axis=0) & (place[0] < nx - 2) & (place[1] < ny - 2)
+    return np.where(good, values - expected, np.nan)
+
+
+def greatest(errors):
+    """Greatest distance; `None` where nothing was resampled."""
+    return float(np.nanmax(np.hypot(*errors))) if errors else None
+
+
+def run_swarp(folder, name):
+    """Resample an image with SWarp: values, and where they are on the sky."""
+    options = {
+        "SUBTRACT_BACK": "N",
+        "RESAMPLING_TYPE": "BILINEAR",
+        "PROJECTION_ERR": "0.0",
+        "FSCALASTRO_TYPE": "NONE",
+        "WRITE_XML": "N",
+        "VERBOSE_TYPE": "QUIET",
+    }
+    arguments = [a for key, value in options.items() for a in (f"-{key}", value)]
+    program = shutil.which("SWarp") or shutil.which("swarp")
+    command = [program, name, "-c", "/dev/null", *arguments]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    values = fits.getdata(folder / "coadd.fits")
+    weights = fits.getdata(folder / "coadd.weight.fits")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        out = WCS(fits.getheader(folder / "coadd.fits"))
+    v, u = np.nonzero(weights > 0.99 * weights.max())
+    step = max(1, len(v) // 2_000_000)
+    v, u = v[::step], u[::step]
+    return values[v, u], out.all_pix2world(u, v, 0)
+
+
 def read_swarp(obj, path):
-    """Resample a ramp with SWarp: where its values come from, against the exact WCS."""
-    swarp = shutil.which("SWarp") or shutil.which("swarp")
-    if swarp is None:
+    """Resample ramps with SWarp: where their values come from, against the exact WCS."""
+    if shutil.which("SWarp") is None and shutil.which("swarp") is None:
         return None
-    ny, nx = obj.solution.image_shape if hasattr(obj, "solution") else obj.image_shape
-    worst, period = [], 4
+    shape = getattr(obj, "solution", obj).image_shape
+    worst = []
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
         for axis in (0, 1):
-            ramp = np.arange(nx)[np.newaxis] if axis == 0 else np.arange(ny)[:, np.newaxis]
-            ramp = np.broadcast_to(ramp % period, (ny, nx)).astype(np.float32)
             header = None if path.suffix == ".head" else fits.getheader(path)
-            fits.PrimaryHDU(ramp, header).writeto(folder / "a.fits", overwrite=True)
+            image = ramp(shape, axis).astype(np.float32)
+            fits.PrimaryHDU(image, header).writeto(folder / "a.fits", overwrite=True)
             if path.suffix == ".head":
                 shutil.copy(path, folder / "a.head")
-            options = {
-                "SUBTRACT_BACK": "N",
-                "RESAMPLING_TYPE": "BILINEAR",
-                "PROJECTION_ERR": "0.0",
-                "FSCALASTRO_TYPE": "NONE",
-                "WRITE_XML": "N",
-                "VERBOSE_TYPE": "QUIET",
-            }
-            arguments = [a for key, value in options.items() for a in (f"-{key}", value)]
-            subprocess.run(
-                [swarp, "a.fits", "-c", "/dev/null", *arguments],
-                cwd=folder,
-                check=True,
-                capture_output=True,
-            )
-            values = fits.getdata(folder / "coadd.fits")
-            weights = fits.getdata(folder / "coadd.weight.fits")
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                out = WCS(fits.getheader(folder / "coadd.fits"))
-            v, u = np.nonzero(weights > 0.99 * weights.max())
-            step = max(1, len(v) // 2_000_000)
-            v, u = v[::step], u[::step]
-            place = np.array(obj.wcs.invert(*out.all_pix2world(u, v, 0)))
-            expected = place[axis] % period
-            good = (expected > 0.5) & (expected < period - 1.5)
-            good &= (place > 1).all(axis=0) & (place[0] < nx - 2) & (place[1] < ny - 2)
-            worst.append(np.abs(values[v, u] - expected)[good].max())
-    return float(np.hypot(*worst))
+            values, sky = run_swarp(folder, "a.fits")
+            worst.append(errors_of(values, np.array(obj.wcs.invert(*sky)), axis, shape))
+    return greatest(worst)
+
+
+def make_image(kind, path, image, header):
+    """Write an image in a file of some kind; give the name of its extension."""
+    if kind == "compressed":
+        hdus = [fits.PrimaryHDU(), fits.CompImageHDU(image, header, compression_type="RICE_1")]
+    elif kind == "multi":
+        hdus = [fits.PrimaryHDU(), fits.ImageHDU(image[:64, :64], header, name="A")]
+        hdus += [fits.ImageHDU(image, header, name="B")]
+        hdus += [fits.BinTableHDU.from_columns([fits.Column("x", "D", array=np.arange(9.0))])]
+    else:
+        hdus = [fits.PrimaryHDU(image, header)]
+    fits.HDUList(hdus).writeto(path, overwrite=True, checksum=kind == "multi")
+    return {"plain": 0, "compressed": 1, "multi": 2}[kind]
+
+
+def bytes_of_others(path, number):
+    """Bytes of all HDUs but one and the tables of the WCS."""
+    found = []
+    with fits.open(path, disable_image_compression=True) as hdus:
+        for k, hdu in enumerate(hdus):
+            ours = hdu.name.startswith(("WPDC_", "WCSDVARR", "WCS-TAB"))
+            info = hdu.fileinfo()
+            if k != number and not ours:
+                with open(path, "rb") as file:
+                    file.seek(info["hdrLoc"])
+                    found.append(file.read(info["datLoc"] + info["datSpan"] - info["hdrLoc"]))
+    return found
+
+
+def into_images(obj):
+    """Print what reproject and SWarp make of images with the WCS in them, px."""
+    shape = getattr(obj, "solution", obj).image_shape
+    old = WCS(naxis=2)
+    old.wcs.ctype = ["RA---TAN-SIP", "DEC--TAN-SIP"]
+    old.wcs.crval, old.wcs.crpix, old.wcs.cd = obj.crval, [7.0, 9.0], np.asarray(obj.cd) * 1.1
+    old = old.to_header(relax=True)
+    old["A_ORDER"], old["B_ORDER"], old["A_2_0"], old["B_0_2"] = 2, 2, 1e-5, -2e-5
+    target = WCS(naxis=2)
+    target.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    target.wcs.crval, target.wcs.cd = obj.crval, _THINNED * np.asarray(obj.cd)
+    target.wcs.crpix = np.asarray(getattr(obj, "solution", obj).crpix) / _THINNED + 1
+    thinned = tuple(n // _THINNED for n in shape)
+    try:
+        from reproject import reproject_interp
+    except ImportError:
+        reproject_interp = None
+    v, u = np.indices(thinned).reshape(2, -1)
+    place = np.array(obj.wcs.invert(*target.all_pix2world(u, v, 0)))
+    print(f"\n{'--into':24}{'printed':>10}{'reproject':>10}{'swarp*':>10}{'SWarp':>10}  other HDUs")
+    for kind in ("plain", "compressed", "multi"):
+        for form in ("tpv", "sip", "cpdis", "tab"):
+            found, swarp = [], []
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "a.fits"
+                for axis in (0, 1):
+                    number = make_image(kind, path, ramp(shape, axis), old)
+                    before = bytes_of_others(path, number)
+                    made = write_into(obj, f"{path}[{number}]", form=form)
+                    same = "the same" if bytes_of_others(path, number) == before else "CHANGED"
+                    if reproject_interp:
+                        values, _ = reproject_interp(path, target, shape_out=thinned, hdu_in=number)
+                        found.append(errors_of(values[v, u], place, axis, shape))
+                    if kind == "plain" and form == "tpv" and shutil.which("SWarp"):
+                        values, sky = run_swarp(Path(folder), "a.fits")
+                        at = np.array(obj.wcs.invert(*sky))
+                        swarp.append(errors_of(values, at, axis, shape))
+            cells = [made.deviation, greatest(found), made.swarp_deviation, greatest(swarp)]
+            print(f"{kind:12}{form:12}" + "".join(map(cell, cells)) + f"  {same}")
+
+
+def cell(value):
+    """One cell of a table."""
+    return f"{'' if value is None else format(value, '.2g'):>10}"
 
 
 def cutouts(obj):
@@ -235,9 +337,10 @@ def main():
         "esutil": read_esutil,
         "wcstools": read_wcstools,
     }
+    titles = [*readers, "swarp*", "SWarp"]
     for name, obj in objects:
         print(f"\n{name}")
-        print(f"{'format':8}{'printed':>10}" + "".join(f"{r:>10}" for r in [*readers, "SWarp"]))
+        print(f"{'format':8}{'printed':>10}" + "".join(f"{r:>10}" for r in titles))
         shape = getattr(obj, "solution", obj).image_shape
         rng = np.random.default_rng(0)
         x, y = (rng.uniform(-0.5, n - 0.5, 20_000) for n in shape[::-1])
@@ -260,13 +363,12 @@ def main():
                             found = reader(path, x[pick], y[pick])
                     row.append(None if found is None else deviation(obj, x[pick], y[pick], found))
                 swarp = form in ("tpv", "head", "fits") and not arguments.no_swarp
-                row.append(read_swarp(obj, path) if swarp else None)
-                print(
-                    f"{form:8}"
-                    + "".join(f"{'' if v is None else format(v, '10.2g'):>10}" for v in row)
-                )
+                row += [made.swarp_deviation, read_swarp(obj, path) if swarp else None]
+                print(f"{form:8}" + "".join(map(cell, row)))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            if max(shape) <= _LARGEST:
+                into_images(obj)
             cutouts(obj)
 
 

@@ -9,9 +9,13 @@ from dataclasses import replace
 import asdf
 import numpy as np
 import pytest
+from astropy.coordinates import ICRS
 from astropy.io import fits
+from astropy.modeling import models
 from astropy.table import Table
 from astropy.wcs import WCS
+from gwcs import WCS as GWCS
+from gwcs import coordinate_frames as cf
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial
@@ -20,6 +24,7 @@ from wpdc_gwcs import build_wcs
 from wpdc_gwcs.exceptions import FileFormatError, InputError, WPDCWarning
 from wpdc_gwcs.export import FORMAT_VERSION, FORMS, make_form
 from wpdc_gwcs.io import OutputExistsError, read, read_wcs, write
+from wpdc_gwcs.io.any_wcs import read_any
 from wpdc_gwcs.io.asdf import _loaded
 from wpdc_gwcs.io.integrity import content_sum
 from wpdc_gwcs.lookup import ResidualMap
@@ -191,6 +196,25 @@ def test_stock_wcs_in_the_file(tmp_path, table):
         read(tmp_path / "stock.asdf")
 
 
+@pytest.mark.parametrize("table", [None, "linear", "cubic"])
+def test_files_satisfy_the_schemas_of_asdf(tmp_path, table):
+    # Which are not looked at when our files are written, but whenever they are read.
+    calibration = make_calibration(table=table)
+    write(calibration, tmp_path / "a.wcs.asdf")
+    write(calibration.solution, tmp_path / "a.solution.asdf")
+    write(calibration, tmp_path / "a.stock.asdf", format="stock")
+    with asdf.config_context() as config:
+        config.validate_on_read = True
+        for name in ("a.wcs.asdf", "a.solution.asdf", "a.stock.asdf"):
+            with asdf.open(tmp_path / name) as file:
+                file.validate()
+        content = (tmp_path / "a.wcs.asdf").read_bytes()
+        assert b"offset: -" in content
+        (tmp_path / "b.asdf").write_bytes(content.replace(b"offset: -", b"offset: x", 1))
+        with pytest.raises(asdf.ValidationError):
+            asdf.open(tmp_path / "b.asdf")
+
+
 def edited(path, tmp_path, edit):
     """A file with other values, and a sum that agrees with them."""
     with asdf.open(path, lazy_load=False, memmap=False) as file:
@@ -251,6 +275,22 @@ def test_truncated_asdf(tmp_path, calibration, part):
         read(tmp_path / "b.asdf")
 
 
+def test_a_small_file_with_blocks(tmp_path):
+    """All of it fits into the buffer of a stream, below which asdf reads."""
+    shift, scale = models.Shift(-5.0), models.Scale(1e-4)
+    sky = models.Pix2Sky_TAN() | models.RotateNative2Celestial(1.0, 2.0, 180.0)
+    frames = cf.Frame2D(name="detector"), cf.CelestialFrame(reference_frame=ICRS(), name="sky")
+    wcs = GWCS([(frames[0], shift & shift | scale & scale | sky), (frames[1], None)])
+    wcs.pixel_shape = (10, 10)
+    tree = {"wcs": wcs, "more": np.arange(3.0)}
+    asdf.AsdfFile(tree).write_to(tmp_path / "a.asdf")
+    state = (tmp_path / "a.asdf").stat()
+    assert state.st_size < getattr(state, "st_blksize", 8192)
+    assert read_wcs(tmp_path / "a.asdf")(5.0, 5.0) == pytest.approx((1.0, 2.0))
+    found = read_any(tmp_path / "a.asdf")
+    assert found.wcs(5.0, 5.0) == pytest.approx((1.0, 2.0))
+
+
 def test_no_asdf_of_ours(tmp_path):
     asdf.AsdfFile({"a": 1}).write_to(tmp_path / "a.asdf")
     with pytest.raises(FileFormatError, match="must have a 'wpdc' tree"):
@@ -260,7 +300,7 @@ def test_no_asdf_of_ours(tmp_path):
 
 
 def test_odd_values_are_refused_by_name(tmp_path, calibration):
-    calibration.settings["filter"] = object()
+    calibration = replace(calibration, settings={"filter": object()})
     with pytest.raises(TypeError, match=r"settings\['filter'\] must be made of plain values"):
         write(calibration, tmp_path / "a.asdf")
     assert os.listdir(tmp_path) == []
@@ -398,7 +438,7 @@ def test_cpdis_says_when_it_cannot(tmp_path, monkeypatch, calibration):
 
 
 def test_head_is_ascii_and_all_of_it(tmp_path, calibration):
-    calibration.settings["observer"] = "Gärtner"
+    calibration = replace(calibration, settings={"observer": "Gärtner"})
     worst = write(calibration, tmp_path / "a.head")
     assert 0.05 < worst < 1.0  # a table as rough as noise
     text = (tmp_path / "a.head").read_bytes()

@@ -193,6 +193,25 @@ def test_detector_of_the_header(tmp_path, cards, detector):
     assert read_frames(tmp_path / "a.fits", detector="X")[0].detector == "X"
 
 
+def test_planes_of_one_cube_are_frames_of_their_own(tmp_path):
+    header = tan_header(INSTRUME="X", EXPNUM=7)
+    cube = np.stack([PIXELS, PIXELS + 1])
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(cube, header, name="A1")]
+    other = tan_header(INSTRUME="X", EXPNUM=7, CRVAL2=2.1)
+    hdus.append(fits.ImageHDU(cube, other, name="B2"))
+    fits.HDUList(hdus).writeto(tmp_path / "a.fits")
+    fits.writeto(tmp_path / "b.fits", cube, header)
+    fits.writeto(tmp_path / "c.fits", PIXELS, header)
+    names = ("a.fits[A1][0]", "a.fits[A1][1]", "a.fits[A1][L]", "a.fits[2][0]", "b.fits[0][1]")
+    frames = [read_frames(f"{tmp_path}/{name}")[0] for name in (*names, "c.fits[0][0]")]
+    found = [frame.name for frame in frames]
+    assert found == ["a_A1_p0", "a_A1_p1", "a_A1_pL", "a_B2_p0", "b_p1", "c"]
+    np.testing.assert_array_equal(frames[1].load_image(), PIXELS + 1)
+    # One detector is not twice in an exposure.
+    assert len({frame.exposure for frame in frames[:3]}) == 3
+    assert frames[0].exposure == frames[3].exposure
+
+
 def test_cube_of_one_plane(tmp_path):
     write_image(tmp_path / "a.fits", PIXELS[None])
     (frame,) = read_frames(tmp_path / "a.fits")

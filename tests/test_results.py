@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
@@ -24,10 +25,11 @@ from wpdc_gwcs import Settings, calibrate, read
 from wpdc_gwcs.calibration import match_frame
 from wpdc_gwcs.calibration import results as results_module
 from wpdc_gwcs.calibration import run as run_module
+from wpdc_gwcs.calibration.cluster import cluster_executor
 from wpdc_gwcs.calibration.manifest import frame_sum, read_manifest
 from wpdc_gwcs.calibration.results import ResultFolder
 from wpdc_gwcs.cli.app import run as command
-from wpdc_gwcs.exceptions import FileFormatError, InputError, InternalError
+from wpdc_gwcs.exceptions import ClusterError, FileFormatError, InputError, InternalError
 from wpdc_gwcs.io import read_frames, read_table
 from wpdc_gwcs.simulation import simulate, write_simulation
 
@@ -301,6 +303,11 @@ def test_a_process_that_dies_has_a_second_try(frames, inputs, tmp_path, once):
         assert message in str(run.failures[frames[0].name])
 
 
+def test_paths_are_no_frames(inputs):
+    with pytest.raises(TypeError, match="as read_frames gives, got PosixPath|WindowsPath|str"):
+        calibrate([inputs[0][0]], inputs[1])
+
+
 def test_frames_that_cannot_travel(frames, inputs):
     frames[0] = replace(frames[0], load_sources=lambda: None)
     run = calibrate(frames, inputs[1], jobs=2)
@@ -367,6 +374,41 @@ def test_a_scheduler_without_workers_is_given_up(inputs, tmp_path, capsys):
         ]
     assert command([*arguments, "--scheduler", "tcp://127.0.0.1:1"]) == 2
     assert "no Dask scheduler answers there" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("gone", ["workers", "scheduler"])
+def test_a_cluster_that_is_lost_ends_the_run(frames, inputs, tmp_path, capsys, gone):
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+    )
+    # The first frame is done, the second one ends all, and the third one waits.
+    # A cluster that is closed ends its workers, and then the scheduler.
+    stop, timeout = (cluster.close, 60.0) if gone == "scheduler" else (partial(cluster.scale, 0), 2)
+    stopped = threading.Event()
+
+    def watch(stage, done, total):
+        if stage == "match" and done == 1:
+            stop()
+            stopped.set()
+
+    slow = [frames[0], *(replace(f, load_sources=partial(time.sleep, 60)) for f in frames[1:])]
+    began = time.monotonic()
+    with (
+        cluster,
+        pytest.raises(ClusterError, match="--resume") as caught,
+        cluster_executor(cluster.scheduler_address, timeout) as pool,
+    ):
+        calibrate(slow, inputs[1], executor=pool, output=tmp_path, progress=watch)
+    assert stopped.is_set()
+    assert time.monotonic() - began < 40
+    said = "the scheduler is gone" if gone == "scheduler" else "none came back within 2 s"
+    assert said in str(caught.value)
+    assert set(check_sets(tmp_path)) == {frames[0].name}
+    # The slow ones are other frames, but what is done needs not be done again.
+    again = calibrate([slow[0], *frames[1:]], inputs[1], output=tmp_path, resume=True)
+    assert again.resumed == (frames[0].name,)
+    assert list(again.summary["status"]) == ["solved"] * 3
 
 
 @pytest.mark.parametrize("moment", ["part", "done"])

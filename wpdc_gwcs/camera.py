@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wpdc_gwcs.frozen import freeze_attributes, frozen_array
 from wpdc_gwcs.models import deproject, project
-from wpdc_gwcs.solution import frozen_array
 
 __all__ = ["Camera", "build_camera"]
 
@@ -65,6 +65,7 @@ class Camera:
         frozen_array(self, "matrices", shape=(n, 2, 2))
         frozen_array(self, "image_shapes", shape=(n, 2), dtype=int)
         frozen_array(self, "cd", shape=(2, 2))
+        freeze_attributes(self, "learned", "files", "solutions", "provenance")
         if self.reference not in self.detectors:
             raise ValueError(f"reference must be one of the detectors, got {self.reference!r}")
 

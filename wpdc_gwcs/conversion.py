@@ -13,6 +13,7 @@ from astropy.wcs.wcsapi import HighLevelWCSWrapper
 
 from wpdc_gwcs.exceptions import WPDCWarning
 from wpdc_gwcs.export import deviation
+from wpdc_gwcs.frozen import with_statistics
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 from wpdc_gwcs.models.powers import fit_polynomial, shift_origin
 from wpdc_gwcs.solution import Calibration, DistortionSolution
@@ -110,8 +111,7 @@ def fit_wcs(wcs, *, image_shape=None, detector="detector", frame="converted"):
             f"{frame}: the converted WCS deviates by up to {worst:.2g} px from the given one",
             WPDCWarning,
         )
-    found.statistics["conversion_deviation"] = worst
-    return found
+    return with_statistics(found, conversion_deviation=worst)
 
 
 def _with_table(found, sky, calibration):

@@ -11,6 +11,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 __all__ = [
     "CatalogError",
     "CentroidWarning",
+    "ClusterError",
     "DetectionError",
     "DuplicateFrameError",
     "FileFormatError",
@@ -47,6 +48,10 @@ class CatalogError(InputError):
 
 class FileFormatError(InputError):
     """A solution, calibration or header file that is damaged, inconsistent or of a newer format."""
+
+
+class ClusterError(InputError):
+    """A cluster that was to do the work, and has no scheduler or no worker."""
 
 
 class FrameFailure(WPDCError):

@@ -5,6 +5,8 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from wpdc_gwcs.frozen import freeze_attributes
+
 __all__ = ["Frame"]
 
 # What no file name, or no table, can hold: slash, line ends and the like, bytes that are not UTF-8.
@@ -103,3 +105,4 @@ class Frame:
                 f"image_shape must be (ny, nx), positive integers, got {self.image_shape!r}"
             )
         object.__setattr__(self, "image_shape", shape)
+        freeze_attributes(self, "meta")

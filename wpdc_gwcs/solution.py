@@ -14,56 +14,16 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from wpdc_gwcs.export.memory import InMemory
+from wpdc_gwcs.frozen import freeze_attributes, frozen_array
 from wpdc_gwcs.models import LookupTable, PVPolynomial, deproject
 from wpdc_gwcs.wcs import build_wcs
 
-__all__ = ["Calibration", "DistortionSolution", "frozen_array"]
+__all__ = ["Calibration", "DistortionSolution"]
 
 # A reference point further off than this, px, is no number of any camera.
 _FARTHEST = 1e9
 # Scales of the two axes differ by less than this factor, or the matrix has no inverse worth having.
 _MOST_CONDITION = 1e6
-
-
-def frozen_array(owner, name, *, shape=None, dtype=float, finite=True):
-    """Turn an attribute of a frozen object into an array of its own that cannot be written to.
-
-    Parameters
-    ----------
-    owner : object
-        Frozen dataclass; an attribute that is `None` is left alone.
-    name : str
-        Name of the attribute.
-    shape : tuple of int or None, optional
-        Shape that it must have; `None` in it for any size.
-    dtype : type, optional
-        Type of the values.
-    finite : bool, optional
-        Whether NaN and infinity are refused.
-
-    Returns
-    -------
-    ndarray or None
-        The array.
-
-    Raises
-    ------
-    ValueError
-        If the shape or a value is not allowed.
-    """
-    value = getattr(owner, name)
-    if value is None:
-        return None
-    value = np.array(value, dtype=dtype)
-    if shape is not None and (
-        value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape))
-    ):
-        raise ValueError(f"{name} must have the shape {shape}, got {value.shape}")
-    if finite and not np.isfinite(value).all():
-        raise ValueError(f"{name} must be finite, got {value.tolist()}")
-    value.flags.writeable = False
-    object.__setattr__(owner, name, value)
-    return value
 
 
 def _freeze_pointing(owner):
@@ -109,7 +69,7 @@ class DistortionSolution(InMemory):
     residual_map : ResidualMap, optional
         Binned residuals behind the table, to which those of other frames can be added.
     statistics, settings, provenance : dict
-        How the solution came about.
+        How the solution came about; they cannot be changed, nor what is in them.
     valid_from, valid_to : float, optional
         Epochs, Julian years, from which on and before which the solution holds; `None` for no limit
         that is known.
@@ -136,6 +96,7 @@ class DistortionSolution(InMemory):
             raise ValueError(f"crpix must be within {_FARTHEST:g} px, got {crpix.tolist()}")
         _freeze_pointing(self)
         _freeze_sigma(self, "table_sigma")
+        freeze_attributes(self, "statistics", "settings", "provenance")
         if self.image_shape is not None:
             shape = tuple(int(n) for n in self.image_shape)
             if len(shape) != 2 or min(shape) < 1 or shape != tuple(self.image_shape):
@@ -288,7 +249,7 @@ class Calibration(InMemory):
     matches, sources : `~astropy.table.Table`, optional
         Pairs and sources of the frame, with units.
     statistics, settings, provenance : dict
-        How the calibration came about.
+        How the calibration came about; they cannot be changed, nor what is in them.
     """
 
     frame: str
@@ -309,6 +270,7 @@ class Calibration(InMemory):
         _freeze_pointing(self)
         _freeze_sigma(self, "sigma")
         frozen_array(self, "color_shift", shape=(2, 3))
+        freeze_attributes(self, "statistics", "settings", "provenance")
 
     @cached_property
     def wcs(self):

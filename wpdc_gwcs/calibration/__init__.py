@@ -13,6 +13,7 @@ together, because they share its detectors and exposures (`solve_camera`).
 """
 
 from wpdc_gwcs.calibration.camera import solve_camera
+from wpdc_gwcs.calibration.cluster import cluster_executor
 from wpdc_gwcs.calibration.matched import MatchedFrame, match_frame
 from wpdc_gwcs.calibration.measure import measure_sources
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
@@ -24,6 +25,7 @@ __all__ = [
     "MatchedFrame",
     "Settings",
     "calibrate",
+    "cluster_executor",
     "match_frame",
     "measure_sources",
     "solve_camera",

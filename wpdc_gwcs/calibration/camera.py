@@ -21,6 +21,7 @@ from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.evaluation import evaluate
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.fitting import MIN_STARS_ATTITUDE, fit_attitude
+from wpdc_gwcs.frozen import with_statistics
 from wpdc_gwcs.matching import pair_nearest
 from wpdc_gwcs.models import deproject
 from wpdc_gwcs.solution import Calibration
@@ -196,9 +197,16 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
             )  # fmt: skip
         except FitError as err:
             failures[frame.name] = err
-    _add_scatter(result.solutions, calibrations, [] if update else solution)
+    scatters = _scatters(calibrations, [] if update else solution)
+    calibrations = [
+        replace(c, solution=_with_scatter(c.solution, scatters))
+        if c.solution.detector in scatters
+        else c
+        for c in calibrations
+    ]
     solved = {c.solution.detector for c in calibrations}
-    return {n: s for n, s in result.solutions.items() if n in solved}, calibrations, failures
+    solutions = {n: _with_scatter(s, scatters) for n, s in result.solutions.items() if n in solved}
+    return solutions, calibrations, failures
 
 
 def _weights(settings, shapes):
@@ -226,8 +234,7 @@ def _dated(solution, frames, stored):
     epochs = [f.epoch for f in frames if f.epoch is not None]
     first, final = (min(epochs), max(epochs)) if epochs else (None, None)
     last = {"first_epoch": first, "last_epoch": final, **last}
-    statistics = {**solution.statistics, "updates": [*before, last]}
-    solution = replace(solution, statistics=statistics)
+    solution = with_statistics(solution, updates=[*before, last])
     if last["process_noise"] == 0:
         return solution
     log.info(
@@ -275,13 +282,20 @@ def _own_reasons(group, err):
     return {f.name: FitError(f"{f.source}: {reasons.get(f.name, err)}") for f in group}
 
 
-def _add_scatter(solutions, calibrations, stored):
-    for name, solution in solutions.items():
-        scatter = [c.statistics["residuals"] for c in calibrations if c.solution.detector == name]
-        if scatter and name not in stored:
-            solution.statistics["sigma_px"] = float(
-                np.median([max(s["sigma_dx"], s["sigma_dy"]) for s in scatter])
-            )
+def _scatters(calibrations, stored):
+    """Scatter of the frames of each detector that is not stored, px."""
+    found = {}
+    for c in calibrations:
+        if c.solution.detector not in stored:
+            of = c.statistics["residuals"]
+            found.setdefault(c.solution.detector, []).append(max(of["sigma_dx"], of["sigma_dy"]))
+    return {name: float(np.median(values)) for name, values in found.items()}
+
+
+def _with_scatter(solution, scatters):
+    if solution.detector not in scatters:
+        return solution
+    return with_statistics(solution, sigma_px=scatters[solution.detector])
 
 
 def _as_calibration(frame, fit, result, **more):
@@ -461,9 +475,8 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
     known = stored is not None or len(result.solutions) > 1
     check_solution(frame, calibration, stored=stored, known=known)
     reasons = shortcomings(frame, calibration, held=held, known=known, stored=stored)
-    statistics["status"] = "degraded" if reasons else "solved"
-    statistics["reasons"] = reasons
-    return with_sky_positions(calibration)
+    status = "degraded" if reasons else "solved"
+    return with_sky_positions(with_statistics(calibration, status=status, reasons=reasons))
 
 
 def _provenance(group, before=None):

@@ -152,7 +152,7 @@ class ResultFolder:
         _check_distinct(self._names.values())
         frames = [frame for group in groups for frame in group]
         files = [*inputs, *(file for frame in frames for file in files_of(frame))]
-        self._inputs = {Path(file).resolve() for file in files}
+        self._inputs = {os.path.realpath(file) for file in files}
         if not self._resume:
             self._check_free(groups)
 
@@ -202,7 +202,7 @@ class ResultFolder:
         if not stat.S_ISREG(mode):
             what = "a folder" if stat.S_ISDIR(mode) else "no file"
             raise InputError(f"{path}: is {what}, and a file of this name would be written")
-        if path.resolve() in self._inputs:
+        if os.path.realpath(path) in self._inputs:
             raise InputError(f"{path}: is an input, and a file of this name would be written")
         if not (self._overwrite or name in self._mine):
             raise InputError(f"{path}: file exists, and is replaced only with --overwrite")

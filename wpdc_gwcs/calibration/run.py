@@ -23,8 +23,16 @@ from wpdc_gwcs.calibration.summary import summarize, summary_row
 from wpdc_gwcs.calibration.workers import Task, Workers, internal_error, stored_of
 from wpdc_gwcs.camera import build_camera
 from wpdc_gwcs.catalogs import fill_motions, read_catalog, split_extension
-from wpdc_gwcs.exceptions import DuplicateFrameError, FitError, InternalError, MatchError, WPDCError
+from wpdc_gwcs.exceptions import (
+    ClusterError,
+    DuplicateFrameError,
+    FitError,
+    InternalError,
+    MatchError,
+    WPDCError,
+)
 from wpdc_gwcs.frame import Frame
+from wpdc_gwcs.frozen import freeze_attributes
 from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["CalibrationRun", "calibrate"]
@@ -38,7 +46,7 @@ class CalibrationRun:
 
     Parameters
     ----------
-    calibrations : list of `Calibration`
+    calibrations : tuple of `Calibration`
         One for each solved frame, in the order of the input.
     solutions : dict
         Detector name to `DistortionSolution`.
@@ -48,7 +56,7 @@ class CalibrationRun:
         One row per frame: status, reason, counts, residual statistics, seconds.
     superseded : dict
         Detector name to the stored solution that an update has found changed, valid until then.
-    cameras : list of `Camera`
+    cameras : tuple of `Camera`
         One for each group of detectors that were solved together.
     run_id : str
         Identity of the run, which all files carry that it writes.
@@ -56,14 +64,18 @@ class CalibrationRun:
         Frames that an earlier run had done, whose results were read from its files.
     """
 
-    calibrations: list
+    calibrations: tuple
     solutions: dict
     failures: dict
     summary: QTable = field(repr=False)
     superseded: dict = field(default_factory=dict)
-    cameras: list = field(default_factory=list)
+    cameras: tuple = ()
     run_id: str = ""
     resumed: tuple = ()
+
+    def __post_init__(self):
+        names = ("calibrations", "solutions", "failures", "superseded", "cameras", "resumed")
+        freeze_attributes(self, *names)
 
 
 @one_blas_thread
@@ -123,11 +135,15 @@ def calibrate(
     ------
     DuplicateFrameError
         If two frames have the same name.
+    TypeError
+        If what is given is no frame, for example the path of one.
     ValueError
         If there is no frame.
     InputError
         If the catalog cannot be used, a file cannot be written or may not be replaced, or a run
         of other choices is to be resumed.
+    ClusterError
+        If the executor has nobody left to do the work; what was done is written.
 
     Warns
     -----
@@ -174,7 +190,7 @@ def calibrate(
         todo = [group for group in groups if group[0].name not in outcomes]
         jobs = min(jobs, sum(map(len, todo)))
         with Workers(jobs, executor) as workers:
-            for group, outcome in zip(todo, _outcomes(todo, run, workers), strict=True):
+            for group, outcome in _outcomes(todo, run, workers):
                 outcomes[group[0].name] = outcome
                 for name, error in outcome.failures.items():
                     _log_details(name, error, folder)
@@ -191,6 +207,10 @@ def _as_frames(frames):
         raise ValueError("calibrate needs at least one frame")
     seen = {}
     for frame in frames:
+        if not isinstance(frame, Frame):
+            raise TypeError(
+                f"frames must be Frame objects, as read_frames gives, got {type(frame).__name__}"
+            )
         if frame.name in seen:
             raise DuplicateFrameError(
                 f"frame names must be unique: {seen[frame.name].source} and {frame.source} would "
@@ -218,31 +238,48 @@ class _Run:
 
 
 def _outcomes(groups, run, workers):
-    """Yield what is found of each group; those behind it are matched in the meantime."""
+    """Yield each group and what is found of it; those behind it are matched in the meantime.
+
+    Where a cluster is lost, what it had done already comes before the error.
+    """
     other = _of_other_detectors(run.frames, run.solution)
     submitted = [{} if other else _submit(group, run, workers, narrow=True) for group in groups]
     counter, n_frames = itertools.count(1), sum(map(len, groups))
     run.progress("match", 0, n_frames)
+    lost = None
     for k, group in enumerate(groups):
         # Taken away, so that what is done needs no memory any more.
         tasks, submitted[k] = submitted[k], None
         results = {frame.name: other[frame.name] for frame in group} if other else {}
-        for name in list(tasks):
-            results[name] = tasks.pop(name)()
-            run.progress("match", next(counter), n_frames)
-        run.progress("solve", k, len(groups))
         try:
-            if not other:
-                results = _match_group(group, results, run, workers)
-            outcome = _solve_group(group, results, run)
-        except Exception as problem:  # noqa: BLE001  One camera is not to end the run of all.
-            error = problem if isinstance(problem, WPDCError) else internal_error(problem)
-            outcome = Outcome(
-                failures={frame.name: error for frame in group},
-                rows=[summary_row(f, results[f.name], None, error, run.settings) for f in group],
-            )
-        yield outcome
+            for name in list(tasks):
+                results[name] = tasks.pop(name)()
+                run.progress("match", next(counter), n_frames)
+            run.progress("solve", k, len(groups))
+            outcome = _outcome_of(group, results, run, None if other else workers)
+        except ClusterError as err:
+            lost = err
+            continue
+        yield group, outcome
+    if lost is not None:
+        raise lost
     run.progress("solve", len(groups), len(groups))
+
+
+def _outcome_of(group, results, run, workers):
+    """Match what could not be matched alone, where there are workers for it, and solve."""
+    try:
+        if workers is not None:
+            results = _match_group(group, results, run, workers)
+        return _solve_group(group, results, run)
+    except ClusterError:
+        raise
+    except Exception as problem:  # noqa: BLE001  One camera is not to end the run of all.
+        error = problem if isinstance(problem, WPDCError) else internal_error(problem)
+        return Outcome(
+            failures={frame.name: error for frame in group},
+            rows=[summary_row(f, results[f.name], None, error, run.settings) for f in group],
+        )
 
 
 def _solve_group(group, results, run):

@@ -32,7 +32,14 @@ from wpdc_gwcs.calibration.matched import (
 )
 from wpdc_gwcs.calibration.measure import measure_sources
 from wpdc_gwcs.calibration.settings import Settings
-from wpdc_gwcs.exceptions import FitError, FrameFailure, InternalError, WPDCError, WPDCWarning
+from wpdc_gwcs.exceptions import (
+    ClusterError,
+    FitError,
+    FrameFailure,
+    InternalError,
+    WPDCError,
+    WPDCWarning,
+)
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.threads import one_blas_thread
 
@@ -200,12 +207,19 @@ class Workers:
         -------
         callable
             Returns the `MatchedFrame` or `FailedFrame`, when it is there.
+
+        Raises
+        ------
+        ClusterError
+            If the executor has nobody left to do it; the same by the callable.
         """
         if self._threads is not None:
             future = self._threads.submit(self._in_process, task)
         elif self._executor is not None:
             try:
                 future = self._executor.submit(match_or_fail, task.alone())
+            except ClusterError:
+                raise
             except Exception as problem:  # noqa: BLE001  As in `match_or_fail`.
                 return partial(FailedFrame, internal_error(problem), 0, 0.0)
         else:
@@ -216,6 +230,9 @@ class Workers:
     def _outcome(self, future):
         try:
             answer = future.result()
+        except ClusterError:
+            # Nobody is there to do the other frames either.
+            raise
         except Exception as problem:  # noqa: BLE001  Such as the death of a worker of an executor.
             return FailedFrame(internal_error(problem), 0, 0.0)
         finally:

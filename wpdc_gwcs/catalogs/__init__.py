@@ -37,6 +37,7 @@ from wpdc_gwcs.catalogs.files import (
     is_fits,
     read_lines,
     read_table_file,
+    special_file,
     split_extension,
 )
 from wpdc_gwcs.catalogs.motions import fill_motions, propagate
@@ -51,5 +52,6 @@ __all__ = [
     "read_lines",
     "read_table_file",
     "select_cone",
+    "special_file",
     "split_extension",
 ]

@@ -1,9 +1,12 @@
 """Tables in files, whatever their format: what astropy reads, and what it stumbles over."""
 
 import bz2
+import csv
 import gzip
 import lzma
+import os
 import re
+import stat
 import struct
 import zlib
 from pathlib import Path
@@ -15,7 +18,14 @@ from astropy.io.registry import IORegistryError
 from astropy.table import Table
 from yaml import YAMLError
 
-__all__ = ["READ_ERRORS", "is_fits", "read_lines", "read_table_file", "split_extension"]
+__all__ = [
+    "READ_ERRORS",
+    "is_fits",
+    "read_lines",
+    "read_table_file",
+    "special_file",
+    "split_extension",
+]
 
 # What astropy, asdf, the decompressors and the parsers raise on damaged or foreign files.
 READ_ERRORS = (
@@ -33,6 +43,7 @@ READ_ERRORS = (
     ExpatError,
     IORegistryError,
     YAMLError,
+    csv.Error,
     fits.VerifyError,
     lzma.LZMAError,
     struct.error,
@@ -74,6 +85,33 @@ def split_extension(path):
         return Path(text), None
     extension = found[2].strip()
     return Path(found[1]), int(extension) if re.fullmatch("[0-9]{1,9}", extension) else extension
+
+
+def special_file(path):
+    """Tell what a path is that is no file: what waits for ever when it is read, or has no end.
+
+    Parameters
+    ----------
+    path : path-like
+        The path.
+
+    Returns
+    -------
+    what : str or None
+        For messages, such as ``a folder`` or ``a pipe``; `None` of a file, and of nothing.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return None
+    kinds = {
+        stat.S_ISDIR: "a folder",
+        stat.S_ISFIFO: "a pipe",
+        stat.S_ISSOCK: "a socket",
+        stat.S_ISCHR: "a device",
+        stat.S_ISBLK: "a device",
+    }
+    return next((what for is_kind, what in kinds.items() if is_kind(mode)), None)
 
 
 def is_fits(path):

@@ -11,7 +11,13 @@ from astropy.io import fits
 from astropy.table import Table
 
 from wpdc_gwcs.catalogs.epochs import reference_epochs
-from wpdc_gwcs.catalogs.files import READ_ERRORS, is_fits, read_table_file, split_extension
+from wpdc_gwcs.catalogs.files import (
+    READ_ERRORS,
+    is_fits,
+    read_table_file,
+    special_file,
+    split_extension,
+)
 from wpdc_gwcs.catalogs.positions import find_positions, read_positions, turn_to_icrs
 from wpdc_gwcs.catalogs.stars import one_of_each, read_identifiers
 from wpdc_gwcs.catalogs.units import UNITS, unit_column
@@ -140,6 +146,8 @@ def _read_table(path, format):
     try:
         if not path.exists():
             raise CatalogError(f"{path}: catalog must be an existing file, found nothing there")
+        if (what := special_file(path)) is not None:
+            raise CatalogError(f"{path}: catalog must be a file, is {what}")
         if path.is_file() and path.stat().st_size == 0:
             raise CatalogError(f"{path}: catalog must not be empty, the file has 0 bytes")
         # The readers warn of odd units and headers; what matters of that is checked afterwards.

@@ -2,8 +2,7 @@
 
 import logging
 import os
-import time
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -196,7 +195,10 @@ def calibrate_command(
     ] = None,
     scheduler_timeout: Annotated[
         float,
-        typer.Option(metavar="SECONDS", help="How long to wait for the scheduler and its workers."),
+        typer.Option(
+            metavar="SECONDS",
+            help="How long to wait for the scheduler, and for a worker whenever there is none.",
+        ),
     ] = 60.0,
     resume: Annotated[
         bool,
@@ -223,6 +225,7 @@ def calibrate_command(
     of the summary says why.
     """
     from wpdc_gwcs.calibration import Settings, calibrate
+    from wpdc_gwcs.calibration.cluster import cluster_executor
     from wpdc_gwcs.calibration.results import ERRORS
     from wpdc_gwcs.io import read_frames
 
@@ -269,7 +272,8 @@ def calibrate_command(
     if report:
         require_free(page, overwrite or resume)
     stored = stored_solutions(solution or [])
-    with executor(scheduler, scheduler_timeout) as pool, progress_bar(quiet=quiet) as progress:
+    cluster = nullcontext() if scheduler is None else cluster_executor(scheduler, scheduler_timeout)
+    with cluster as pool, progress_bar(quiet=quiet) as progress:
         run = calibrate(
             loaded,
             catalog,
@@ -375,52 +379,6 @@ def print_changes(run):
             f"{last['max_change_px']:.4f} px at most ({exposures}, log evidence "
             f"{last['evidence']:.1f}){kept}"
         )
-
-
-@contextmanager
-def executor(address, timeout):
-    """Connect to the Dask cluster at an address.
-
-    Parameters
-    ----------
-    address : str or None
-        Address of its scheduler.
-    timeout : float
-        Seconds to wait for the scheduler, and for a worker.
-
-    Yields
-    ------
-    concurrent.futures.Executor or None
-        None without an address.
-    """
-    if address is None:
-        yield None
-        return
-    try:
-        from dask.distributed import Client
-    except ImportError as err:
-        raise InputError(
-            "--scheduler needs Dask, which is not installed: pip install 'wpdc_gwcs[dask]'"
-        ) from err
-    # What Dask has to say of lost connections goes to its own log; the outcome is told here.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    began = time.monotonic()
-    try:
-        client = Client(address, timeout=timeout)
-    except (OSError, ValueError, TimeoutError) as err:
-        raise InputError(f"--scheduler {address}: no Dask scheduler answers there: {err}") from err
-    with client:
-        if not client.scheduler_info(n_workers=-1)["workers"]:
-            log.warning(
-                "%s: the Dask scheduler has no worker yet; waiting at most %g s", address, timeout
-            )
-            try:
-                client.wait_for_workers(1, timeout=max(timeout - time.monotonic() + began, 0.1))
-            except TimeoutError as err:
-                raise InputError(
-                    f"--scheduler {address}: must have a worker within {timeout:g} s, has none"
-                ) from err
-        yield client.get_executor(pure=False)
 
 
 def print_summary(run, folder):

@@ -10,6 +10,9 @@ from wpdc_gwcs.cli.files import CalibrationFile, read_one
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free
 from wpdc_gwcs.exceptions import InputError
 
+# What SWarp makes of TPV is told where it is worse than for others by this factor, and not nothing.
+_AS_GOOD = 1.1
+_TOLD_PX = 1e-3
 FORMATS = ("fits", "cpdis", "tpv", "head", "sip", "tab", "stock")
 
 Degree = Annotated[
@@ -137,6 +140,10 @@ def _greatest(worst):
 
 
 def _note(made):
+    if (made.swarp_deviation or 0.0) > max(_AS_GOOD * (made.deviation or 0.0), _TOLD_PX):
+        return (
+            f" (greatest deviation {made.deviation:.2g} px, in SWarp {made.swarp_deviation:.2g} px)"
+        )
     if made.form != "fits":
         return _greatest(made.deviation)
     exact = "exact" if made.deviation is None else f"greatest deviation {made.deviation:.2g} px"

@@ -58,7 +58,7 @@ def _as_defaults(ctx, text, where):
     """Make the options in a TOML text the defaults of the command; what is typed still wins."""
     try:
         values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as err:
+    except (ValueError, RecursionError) as err:  # numbers of 5,000 digits, and lists in lists
         raise InputError(f"{where}: not valid TOML: {err}") from err
     known = {p.name: p for p in ctx.command.params}
     defaults = dict(ctx.default_map or {})
@@ -90,6 +90,10 @@ def _load_preset(ctx: typer.Context, name: str | None):
 def _load_config(ctx: typer.Context, path: Path | None):
     if path is None or ctx.resilient_parsing:
         return path
+    from wpdc_gwcs.catalogs import special_file
+
+    if (what := special_file(path)) is not None:
+        raise InputError(f"{path}: the configuration must be a file, is {what}")
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as err:

@@ -50,6 +50,9 @@ class FitsForm:
         For ``fits``: the same for readers of the keywords alone.
     inverse_deviation : float or None
         For ``sip``: greatest deviation of the inverse polynomials, px.
+    swarp_deviation : float or None
+        For ``tpv`` and ``head``: greatest deviation in SWarp, whose way from sky to pixel is not
+        exact, px.
     written : Calibration or DistortionSolution or None
         For ``fits`` and ``cpdis``: the same mapping with the polynomial that the keywords have.
     """
@@ -60,6 +63,7 @@ class FitsForm:
     deviation: float | None = None
     keywords_deviation: float | None = None
     inverse_deviation: float | None = None
+    swarp_deviation: float | None = None
     written: object = None
 
 
@@ -93,8 +97,13 @@ def make_form(obj, form, *, degree=None, versions: Mapping = MappingProxyType({}
     if form not in FORMS:
         raise ValueError(f"format must be one of {', '.join(FORMS)}, got {form!r}")
     if form in ("tpv", "head"):
-        pv, worst = fit_tpv(obj, degree)
-        return FitsForm(form, tpv_keywords(obj, pv), deviation=worst)
+        tpv = fit_tpv(obj, degree)
+        return FitsForm(
+            form,
+            tpv_keywords(obj, tpv.pv, crpix=tpv.crpix, cd=tpv.cd),
+            deviation=tpv.deviation,
+            swarp_deviation=tpv.swarp_deviation,
+        )
     if form == "sip":
         header, worst, inverse_worst = sip_keywords(obj, degree)
         return FitsForm(form, header, deviation=worst, inverse_deviation=inverse_worst)

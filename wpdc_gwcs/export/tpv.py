@@ -6,6 +6,7 @@
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,11 +20,12 @@ from wpdc_gwcs.export.exact import (
     require_shape,
     sample_plane,
 )
+from wpdc_gwcs.export.swarp import nearer_linear_part, step_errors
 from wpdc_gwcs.models import LookupTable, PVPolynomial, pv_terms
 from wpdc_gwcs.models.attitude import fold_attitude
 from wpdc_gwcs.models.powers import fit_polynomial, shift_origin
 
-__all__ = ["fit_tpv", "fold_polynomial", "refit", "tpv_keywords"]
+__all__ = ["TpvFit", "fit_tpv", "fold_polynomial", "nearest_polynomial", "refit", "tpv_keywords"]
 
 # A fit this good (px) is good enough; a higher degree would only be harder to read.
 _ENOUGH_PX = 1e-3
@@ -32,6 +34,22 @@ _NEARLY = 1.1
 _DEGREES = range(1, 8)
 # Nodes along each axis of the table of what a polynomial leaves, where there was none.
 _TABLE_NODES = 50
+
+
+class TpvFit(NamedTuple):
+    """TPV that is near to a mapping.
+
+    ``crpix`` (px, zero based), ``cd`` (deg / px), the polynomial ``pv`` behind them, and the
+    greatest deviation from the exact WCS in px: ``deviation`` for readers that do as the keywords
+    say, ``swarp_deviation`` for SWarp, which goes from sky to pixel by three steps.  `None` where
+    the shape of the detector is unknown, or the way of SWarp.
+    """
+
+    crpix: np.ndarray
+    cd: np.ndarray
+    pv: PVPolynomial
+    deviation: float | None
+    swarp_deviation: float | None
 
 
 def fold_polynomial(obj):
@@ -54,15 +72,19 @@ def fold_polynomial(obj):
     return fold_attitude(exact.solution.pv, np.linalg.solve(nominal.T, exact.cd.T).T)
 
 
-def tpv_keywords(obj, pv):
-    """Give the header of a polynomial in the matrix of the exposure.
+def tpv_keywords(obj, pv, *, crpix=None, cd=None):
+    """Give the header of a polynomial.
 
     Parameters
     ----------
     obj : Calibration or DistortionSolution
-        Where CRPIX, CD and CRVAL are from.
+        Where CRVAL is from, and CRPIX and CD by default.
     pv : PVPolynomial
         The polynomial.
+    crpix : (2,) array_like, optional
+        Reference point in front of it, px, zero based.
+    cd : (2, 2) array_like, optional
+        Matrix in front of it, deg / px.
 
     Returns
     -------
@@ -70,7 +92,8 @@ def tpv_keywords(obj, pv):
         Numbers with 17 digits.
     """
     exact = description(obj)
-    header = linear_cards("TPV", exact.solution.crpix, exact.cd, exact.crval)
+    crpix = exact.solution.crpix if crpix is None else crpix
+    header = linear_cards("TPV", crpix, exact.cd if cd is None else cd, exact.crval)
     for axis in (1, 2):
         for j, value in zip(pv.term_indices, pv.coefficients[axis - 1], strict=True):
             header.append(number_card(f"PV{axis}_{j}", value, "[deg] distortion"), end=True)
@@ -78,6 +101,50 @@ def tpv_keywords(obj, pv):
 
 
 def fit_tpv(obj, degree=None):
+    """Find the TPV that is nearest to the whole mapping, look-up table included.
+
+    Parameters
+    ----------
+    obj : Calibration or DistortionSolution
+        What is exported.
+    degree : int, optional
+        Degree, 1 to 7; see `nearest_polynomial`.
+
+    Returns
+    -------
+    tpv : TpvFit
+        CRPIX and CD are those of the exposure, unless SWarp comes nearer with others.
+
+    Raises
+    ------
+    ValueError
+        If the degree is not from 1 to 7.
+    """
+    exact = description(obj)
+    pv, worst = nearest_polynomial(obj, degree)
+    plain = TpvFit(np.asarray(exact.solution.crpix), exact.cd, pv, worst, None)
+    if image_shape_of(obj) is None:
+        return plain
+    plain = plain._replace(swarp_deviation=_swarp_deviation(obj, plain))
+    left = plain.swarp_deviation
+    # Radial terms are not to be had about another point.
+    if pv.radial or (left is not None and left <= max(_NEARLY * worst, _ENOUGH_PX)):
+        return plain
+    cd, crpix, matrix, offset = nearer_linear_part(pv, plain.cd, plain.crpix, image_shape_of(obj))
+    pixels, _ = sample_plane(obj)
+    u = cd @ (pixels - crpix[:, np.newaxis])
+    values = np.array(pv(*(matrix @ u + offset[:, np.newaxis])))
+    other = TpvFit(crpix, cd, _fit(u, values, pv.degree), None, None)
+    other = other._replace(
+        deviation=deviation(obj, astropy_sky(tpv_keywords(obj, other.pv, crpix=crpix, cd=cd))),
+        swarp_deviation=_swarp_deviation(obj, other),
+    )
+    if other.swarp_deviation is None or other.deviation > max(_NEARLY * worst, _ENOUGH_PX):
+        return plain
+    return plain if left is not None and left <= other.swarp_deviation else other
+
+
+def nearest_polynomial(obj, degree=None):
     """Find the polynomial that is nearest to the whole mapping, look-up table included.
 
     Parameters
@@ -111,10 +178,12 @@ def fit_tpv(obj, degree=None):
             require_shape(obj)
         else:
             return pv, None if image_shape_of(obj) is None else _tpv_deviation(obj, pv)
-    samples = sample_plane(obj)
+    exact = description(obj)
+    pixels, plane = sample_plane(obj)
+    u = exact.cd @ (pixels - np.reshape(exact.solution.crpix, (2, 1)))
     trials = []
     for n in _DEGREES if degree is None else [degree]:
-        pv = _fit(obj, *samples, n)
+        pv = _fit(u, plane, n)
         trials.append((_tpv_deviation(obj, pv, n=151), pv))
         if trials[-1][0] <= _ENOUGH_PX:
             break
@@ -141,7 +210,7 @@ def refit(obj, degree):
     """
     exact = description(obj)
     ny, nx = require_shape(obj)
-    pv, _ = fit_tpv(obj, degree)
+    pv, _ = nearest_polynomial(obj, degree)
     table = obj.lookup_table
     if table is None:
         grids = [np.linspace(-0.5, n - 0.5, _TABLE_NODES) for n in (nx, ny)]
@@ -165,9 +234,20 @@ def _tpv_deviation(obj, pv, **options):
     return deviation(obj, astropy_sky(tpv_keywords(obj, pv)), **options)
 
 
-def _fit(obj, pixels, plane, degree):
+def _swarp_deviation(obj, tpv, n=101):
+    """Greatest distance of SWarp's pixels from those of the exact WCS, px."""
     exact = description(obj)
-    u = exact.cd @ (pixels - np.reshape(exact.solution.crpix, (2, 1)))
+    ny, nx = image_shape_of(obj)
+    x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, n), np.linspace(-0.5, ny - 0.5, n))
+    pixels = np.array([x.ravel(), y.ravel()])
+    crpix = np.reshape(exact.solution.crpix, (2, 1))
+    plane = exact.cd @ (np.array(obj.undistort(*pixels)) - crpix)
+    u = tpv.cd @ (pixels - np.reshape(tpv.crpix, (2, 1)))
+    errors = step_errors(tpv.pv, u, plane)
+    return None if errors is None else float(np.hypot(*np.linalg.solve(tpv.cd, errors)).max())
+
+
+def _fit(u, plane, degree):
     polynomial = shift_origin(*fit_polynomial(u, plane, degree))
     terms = pv_terms(degree)
     coefficients = np.array(

@@ -32,10 +32,12 @@ frames are not known any more.  Those before 1.2.0 have no ``content_sum``.
 import dataclasses
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import asdf
 import numpy as np
+from asdf.extension import Extension, TagDefinition
 
 from wpdc_gwcs.camera import Camera
 from wpdc_gwcs.exceptions import FileFormatError, InputError
@@ -52,6 +54,9 @@ __all__ = ["read_asdf", "read_asdf_wcs", "sum_of", "write_asdf", "write_stock"]
 _NOT_STORED = {"matches", "sources"}
 _NOT_IN_FRAMES = {"residual_map"}
 _FIRST_WITH_SUM = (1, 2)
+# Arrays of up to so many values stand in the tree, where they are legible: CRPIX, CD, a cubic.  The
+# nodes of tables do not: as text they take more time than all else.
+_INLINE_VALUES = 20
 
 
 def write_asdf(obj, path, *, overwrite=False):
@@ -237,18 +242,41 @@ def _check_content(tree, version, path):
         )
 
 
+class _Unchecked(Extension):
+    """The tags of other extensions, without the schemas that their content is checked by.
+
+    asdf checks a tree whenever it is read and whenever it is written.  To write, that took more
+    than half of the time, and what our trees have with schemas is what the converters of asdf and
+    gwcs have just made.
+    """
+
+    extension_uri = "asdf://wpdc_gwcs/extensions/unchecked-1.0.0"
+
+    def __init__(self, uris):
+        self._tags = [TagDefinition(uri) for uri in uris]
+
+    @property
+    def tags(self):
+        return self._tags
+
+
+@lru_cache(maxsize=1)
+def _unchecked(extensions):
+    return _Unchecked(dict.fromkeys(tag.tag_uri for one in extensions for tag in one.tags))
+
+
 def _write_tree(tree, path, overwrite, compression=None):
     # A context copies what is loaded: extensions are to be looked for once, not for every file.
-    _ = asdf.get_config().extensions
+    unchecked = _unchecked(tuple(asdf.get_config().extensions))
     with (
         atomic_path(path, overwrite=overwrite) as temporary,
         asdf.config_context() as config,
         # Open, because asdf takes a path for a URL, in which '#', '?', ';' and '%' end the name.
         open(temporary, "wb") as stream,
     ):
-        # Small arrays stay legible.
-        config.array_inline_threshold = 64
-        asdf.AsdfFile(tree).write_to(stream, all_array_compression=compression)
+        config.array_inline_threshold = _INLINE_VALUES
+        file = asdf.AsdfFile(tree, extensions=[unchecked])
+        file.write_to(stream, all_array_compression=compression)
 
 
 def _read_entry(path, key, *, whole=False):

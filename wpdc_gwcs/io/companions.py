@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from wpdc_gwcs.exceptions import FrameError, WPDCWarning
-from wpdc_gwcs.io.files import READ_ERRORS, first_line, open_fits, split_extension
+from wpdc_gwcs.io.files import open_fits, split_extension
 from wpdc_gwcs.io.headers import find_extension, header_text
+from wpdc_gwcs.io.images import pixels_of
 from wpdc_gwcs.robust import robust_scatter
 
 __all__ = [
@@ -183,8 +184,8 @@ def _looks_like_mask(hdu):
     if hdu.header.get("BITPIX", -32) < 0:
         return False
     try:
-        return bool(np.mean(np.asarray(hdu.data) == 0) > 0.5)
-    except READ_ERRORS:
+        return bool(np.mean(np.asarray(pixels_of(hdu, "image")) == 0) > 0.5)
+    except FrameError:
         return False
 
 
@@ -415,8 +416,5 @@ def _read(companion, shape):
         header = hdu.header.copy()
         if "TELESCOP" not in header and "TELESCOP" in hdus[0].header:
             header["TELESCOP"] = hdus[0].header["TELESCOP"]
-        try:
-            data = np.array(hdu.data)
-        except READ_ERRORS as problem:
-            raise FrameError(f"{where}: damaged image: {first_line(problem)}") from problem
+        data = np.array(pixels_of(hdu, where))
     return data.reshape(shape), header

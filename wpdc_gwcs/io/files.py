@@ -13,7 +13,7 @@ from pathlib import Path
 
 from astropy.io import fits
 
-from wpdc_gwcs.catalogs import READ_ERRORS, split_extension
+from wpdc_gwcs.catalogs import READ_ERRORS, special_file, split_extension
 from wpdc_gwcs.exceptions import FileFormatError, InputError
 
 __all__ = [
@@ -146,6 +146,8 @@ def file_kind(path, *, error=FileFormatError):
         If the file is missing, unreadable or empty, or is not what its name says.
     """
     path = Path(path)
+    if (what := special_file(path)) is not None:
+        raise error(f"{path}: must be a file, is {what}")
     try:
         with open(path, "rb") as file:
             start = file.read(81)
@@ -197,6 +199,8 @@ def open_fits(path, *, error=FileFormatError, lazy=False):
     calibration; so do not warn of one's own inside the block.
     """
     path = Path(path)
+    if (what := special_file(path)) is not None:
+        raise error(f"{path}: must be a file, is {what}")
     number = _check_once(path, error)
     # Open, so that it is closed whatever astropy makes of it, and '~' is a name like any other.
     with warnings.catch_warnings(), open(path, "rb") as stream:

@@ -80,6 +80,8 @@ def write_form(obj, path, *, form, degree=None, overwrite=False):
         add_history(header, f"greatest deviation from the exact WCS: {made.deviation:.3g} px")
     if made.inverse_deviation is not None:
         add_history(header, f"that of the inverse polynomials: {made.inverse_deviation:.3g} px")
+    if made.swarp_deviation is not None:
+        add_history(header, f"that of SWarp: {made.swarp_deviation:.3g} px")
     if form == "head":
         _write_text(header, path, image_shape_of(obj), overwrite)
         return made

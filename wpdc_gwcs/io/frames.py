@@ -226,7 +226,7 @@ def read_frames(
             _refuse_planes(part["where"], planes)
         part["companions"] = _companions(part, companions, planes)
         part["mask_bits"] = mask_bits
-        label = part["label"] if several else ""
+        label = "_".join([part["label"]] * several + part["chosen"])
         frames.append(_frame_of(part, path, stem, label, detector, image_shape, exposure_keyword))
     frames = [replace(f, **by_hand) for f in _distinct(frames, prepared)]
     if not camera:
@@ -342,7 +342,11 @@ def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
     shape = image_shape(header) if kind == "image" else header_shape(header)
     if shape is None:
         shape = header_shape(wcs_header)
+    chosen = []
     if kind == "image":
+        if plane is not None and planes_of(header) > 1:
+            # Other planes of the cube may be frames of the same run.
+            chosen = [f"p{plane}"]
         plane = choose_plane(header, plane, f"{where}" if "[" in where else f"{where}[{index}]")
     # While a file is open, no warning is shown: ours are repeated when it is closed.
     with warnings.catch_warnings(record=True) as seen:
@@ -363,6 +367,7 @@ def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
         "index": index,
         "where": where,
         "label": label,
+        "chosen": chosen,
         "headers": headers,
         "shape": shape,
         "wcs": parsed,
@@ -407,7 +412,7 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
         source=where,
         gain=image_gain(headers),
         saturation=image_saturation(headers),
-        **_keys_of(headers, exposure_keyword, where),
+        **_keys_of(headers, exposure_keyword, where, part["chosen"]),
         meta=_facts(headers) | _choices(part),
         inputs=tuple(c.path for c in part["companions"] if c.given),
         **loaders,
@@ -443,9 +448,12 @@ def _image_loaders(part, path):
     return loaders
 
 
-def _keys_of(headers, exposure_keyword, where):
+def _keys_of(headers, exposure_keyword, where, chosen=()):
     """Find camera and exposure; a frame that does not tell its camera is on its own."""
     exposure = exposure_key(headers, keyword=exposure_keyword, name=where)
+    if exposure is not None and chosen:
+        # Planes of a cube are of one detector, and so of different exposures.
+        exposure = "_".join([exposure, *chosen])
     camera = camera_key(headers)
     if camera is None and exposure_keyword is not None:
         camera = _CAMERA

@@ -14,7 +14,7 @@ from astropy import units as u
 
 from wpdc_gwcs.exceptions import FrameError
 from wpdc_gwcs.io.dates import EXPOSURE_KEYS
-from wpdc_gwcs.io.files import READ_ERRORS, first_line, open_fits
+from wpdc_gwcs.io.files import first_line, open_fits
 from wpdc_gwcs.io.headers import header_text, positive_number
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "image_saturation",
     "image_shape",
     "load_image",
+    "pixels_of",
     "planes_of",
     "split_plane",
 ]
@@ -242,14 +243,37 @@ def load_image(path, index, plane=0):
         # Taken first: astropy drops them from the header when it scales.
         blank = hdu.header.get("BLANK", hdu.header.get("ZBLANK"))
         scale, zero = hdu.header.get("BSCALE", 1.0), hdu.header.get("BZERO", 0.0)
-        try:
-            data = hdu.data
-        except READ_ERRORS as problem:
-            raise FrameError(f"{where}: damaged image: {first_line(problem)}") from problem
+        data = pixels_of(hdu, where)
         planes = data.reshape(-1, *data.shape[-2:])
         if plane == LUMINANCE:
             return sum(_as_float(p, blank, scale, zero) for p in planes)
         return _as_float(planes[plane], blank, scale, zero)
+
+
+def pixels_of(hdu, where):
+    """Read the pixels of an extension.
+
+    Parameters
+    ----------
+    hdu : HDU
+        Image, compressed or not.
+    where : str
+        For messages: ``path[EXT]``.
+
+    Returns
+    -------
+    data : ndarray
+        As astropy has it.
+
+    Raises
+    ------
+    FrameError
+        If the data are damaged.
+    """
+    try:
+        return hdu.data
+    except Exception as problem:  # noqa: BLE001  Decompression has an exception without a name.
+        raise FrameError(f"{where}: damaged image: {first_line(problem)}") from problem
 
 
 def _as_float(data, blank, scale, zero):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from wpdc_gwcs.frozen import freeze_attributes
 from wpdc_gwcs.matching._mapping import SmoothMap
 
 __all__ = ["MatchDiagnostics"]
@@ -69,6 +70,9 @@ class MatchDiagnostics:
     areas: tuple
     timings: dict = field(default_factory=dict)
     search_significance: float = float("nan")
+
+    def __post_init__(self):
+        freeze_attributes(self, "areas", "timings")
 
     def to_dict(self):
         """Return the plain numbers (no mapping, areas summed up) for tables and files."""

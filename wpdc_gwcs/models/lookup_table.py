@@ -126,13 +126,18 @@ class LookupTable(Model):
 
     @property
     def dx(self):
-        """Displacement along x at the nodes, ``[iy, ix]``, in pixels."""
-        return self.displacement.value[0]
+        """Displacement along x at the nodes, ``[iy, ix]``, in pixels (read-only)."""
+        return self._nodes(0)
 
     @property
     def dy(self):
-        """Displacement along y at the nodes, ``[iy, ix]``, in pixels."""
-        return self.displacement.value[1]
+        """Displacement along y at the nodes, ``[iy, ix]``, in pixels (read-only)."""
+        return self._nodes(1)
+
+    def _nodes(self, axis):
+        view = self.displacement.value[axis]
+        view.flags.writeable = False
+        return view
 
     @property
     def method(self):

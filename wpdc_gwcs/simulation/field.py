@@ -11,6 +11,7 @@ from astropy.time import Time
 from astropy.wcs import WCS
 
 from wpdc_gwcs.detector import on_detector
+from wpdc_gwcs.frozen import freeze_attributes
 from wpdc_gwcs.simulation._camera import SIGMA_PER_FWHM, Camera, find_zero_point
 from wpdc_gwcs.simulation.distortion import Distortion
 from wpdc_gwcs.simulation.exposure import SimulatedExposure
@@ -41,6 +42,9 @@ class Simulation:
     exposures: tuple[SimulatedExposure, ...]
     distortion: Distortion
     settings: dict
+
+    def __post_init__(self):
+        freeze_attributes(self, "settings")
 
 
 def simulate(

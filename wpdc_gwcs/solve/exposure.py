@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wpdc_gwcs.frozen import freeze_attributes
 from wpdc_gwcs.models import LookupTable, PVPolynomial
 
 __all__ = ["Exposure", "ExposureFit", "SolveResult"]
@@ -103,6 +104,9 @@ class ExposureFit:
     reason: str | None = None
     statistics: dict = dataclasses.field(default_factory=dict)
 
+    def __post_init__(self):
+        freeze_attributes(self, "statistics")
+
 
 @dataclass(frozen=True, eq=False)
 class SolveResult:
@@ -127,6 +131,9 @@ class SolveResult:
     rejected: dict
     table_infos: dict = dataclasses.field(default_factory=dict)
     reference_color: float | None = None
+
+    def __post_init__(self):
+        freeze_attributes(self, "solutions", "rejected", "table_infos")
 
     @property
     def solution(self):

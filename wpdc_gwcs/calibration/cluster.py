@@ -1,0 +1,162 @@
+"""A Dask cluster as an executor that does not wait for ever.
+
+::
+
+    submit --> the client's executor --> workers
+                     |                      |
+                     +--- future <--- watch: is there a scheduler, is there a worker?
+
+Dask waits for workers without a limit, and takes a scheduler that is gone for tasks that were given
+up.  Here both end the run with an error that says so; what was written until then is kept.
+"""
+
+import contextlib
+import logging
+import threading
+import time
+from concurrent.futures import Executor, Future
+from functools import partial
+
+from wpdc_gwcs.exceptions import ClusterError
+
+__all__ = ["cluster_executor"]
+
+log = logging.getLogger(__name__)
+
+# How often workers are counted, s.
+_PERIOD = 0.5
+_GO_ON = "what is done is kept: go on with --resume (resume=True)"
+
+
+@contextlib.contextmanager
+def cluster_executor(address, timeout):
+    """Connect to the Dask cluster at an address.
+
+    Parameters
+    ----------
+    address : str
+        Address of its scheduler.
+    timeout : float
+        Seconds to wait for the scheduler, and for a worker whenever there is none.
+
+    Yields
+    ------
+    concurrent.futures.Executor
+        For `calibrate`.
+
+    Raises
+    ------
+    ClusterError
+        If Dask is not installed, no scheduler answers, or there is no worker for so long.  Later on
+        it is raised by the futures.
+    """
+    try:
+        from dask.distributed import Client
+    except ImportError as err:
+        raise ClusterError(
+            "--scheduler needs Dask, which is not installed: pip install 'wpdc_gwcs[dask]'"
+        ) from err
+    # What Dask has to say of lost connections goes to its own log; the outcome is told here.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    began = time.monotonic()
+    try:
+        client = Client(address, timeout=timeout)
+    except (OSError, ValueError, TimeoutError) as err:
+        raise ClusterError(
+            f"--scheduler {address}: no Dask scheduler answers there: {err}"
+        ) from err
+    with client:
+        if not client.scheduler_info(n_workers=-1)["workers"]:
+            log.warning(
+                "%s: the Dask scheduler has no worker yet; waiting at most %g s", address, timeout
+            )
+            try:
+                client.wait_for_workers(1, timeout=max(timeout - time.monotonic() + began, 0.1))
+            except TimeoutError as err:
+                raise ClusterError(
+                    f"--scheduler {address}: must have a worker within {timeout:g} s, has none"
+                ) from err
+        pool = _WatchedExecutor(client, address, timeout)
+        try:
+            yield pool
+        finally:
+            pool.shutdown(wait=False)
+
+
+class _WatchedExecutor(Executor):
+    """The executor of a client, whose futures fail when there is nobody to do the work."""
+
+    def __init__(self, client, address, timeout):
+        self._client, self._address, self._timeout = client, address, timeout
+        self._pool = client.get_executor(pure=False)
+        self._lock = threading.Lock()
+        self._waiting = set()
+        self._error = None
+        self._ended = threading.Event()
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        with self._lock:
+            if self._error is not None:
+                raise self._error
+            self._waiting.add(future)
+        inner = self._pool.submit(fn, *args, **kwargs)
+        inner.add_done_callback(partial(self._pass_on, future))
+        return future
+
+    def shutdown(self, wait=True, *, cancel_futures=False):  # noqa: FBT002  As of Executor.
+        self._ended.set()
+        self._pool.shutdown(wait=wait)
+
+    def _pass_on(self, future, inner):
+        with self._lock:
+            if future not in self._waiting:
+                return
+            self._waiting.discard(future)
+        if not future.set_running_or_notify_cancel():
+            return
+        if inner.cancelled():
+            future.set_exception(
+                ClusterError(f"--scheduler {self._address}: the scheduler is gone; {_GO_ON}")
+            )
+        elif inner.exception() is not None:
+            future.set_exception(inner.exception())
+        else:
+            future.set_result(inner.result())
+
+    def _watch(self):
+        """Done by a thread: count the workers, and give up when there are none for too long."""
+        since = None
+        while not self._ended.wait(_PERIOD):
+            if self._has_workers():
+                since = None
+            elif since is None:
+                since = time.monotonic()
+                log.warning(
+                    "%s: all workers of the Dask scheduler are gone; waiting at most %g s",
+                    self._address,
+                    self._timeout,
+                )
+            elif time.monotonic() - since > self._timeout:
+                self._give_up()
+                return
+
+    def _has_workers(self):
+        try:
+            # A client that has lost its scheduler knows nothing of workers.
+            return bool(self._client.scheduler_info(n_workers=-1).get("workers"))
+        except (OSError, RuntimeError, TimeoutError):
+            return False
+
+    def _give_up(self):
+        error = ClusterError(
+            f"--scheduler {self._address}: all workers are gone, and none came back within "
+            f"{self._timeout:g} s; {_GO_ON}"
+        )
+        with self._lock:
+            self._error = error
+            left, self._waiting = self._waiting, set()
+        for future in left:
+            if future.set_running_or_notify_cancel():
+                future.set_exception(error)

@@ -1,0 +1,105 @@
+"""How SWarp goes back from the sky to pixels, and the linear part that makes its way a good one.
+
+::
+
+    X = PV(U):    U_0 = X,    U_k+1 = U_k - (PV(U_k) - X),    k = 0, 1, 2
+
+SWarp (2.40 and later, ``pv_to_raw``) makes these three steps and no more.  What they leave is the
+distortion times the third power of its gradient: nothing for most cameras, 0.1 px where 200 px are
+spread over 9,000.  How much of a mapping is linear part and how much polynomial is free, and three
+steps come further the nearer the polynomial is to no distortion at all.
+"""
+
+import numpy as np
+from scipy.optimize import least_squares
+
+__all__ = ["nearer_linear_part", "step_errors"]
+
+_STEPS = 3
+# Above this, deg, SWarp takes a polynomial fitted to the inverse instead of its steps.
+_MOST_DEG = 1e-3
+# Nodes along each axis that the linear part is chosen on; the worst ones are at the edges.
+_NODES = 13
+# Evaluations of the errors and their derivatives, which end as good as do a hundred.
+_MOST_EVALUATIONS = 30
+
+
+def step_errors(pv, u, plane):
+    """Errors of the three steps.
+
+    Parameters
+    ----------
+    pv : callable
+        Polynomial, ``pv(u, v)``.
+    u : (2, N) ndarray
+        Where the steps should end, deg.
+    plane : (2, N) ndarray
+        Standard coordinates that they start from, deg.
+
+    Returns
+    -------
+    errors : (2, N) ndarray or None
+        Where they end less where they should, deg; `None` where SWarp would not make them.
+    """
+    errors = _steps(pv, plane) - u
+    return None if np.abs(errors).max(initial=0.0) > _MOST_DEG else errors
+
+
+def nearer_linear_part(pv, cd, crpix, image_shape):
+    """Choose the linear part in front of a polynomial for which the three steps end nearest.
+
+    Parameters
+    ----------
+    pv : callable
+        Polynomial behind the present linear part.
+    cd : (2, 2) ndarray
+        Present matrix, deg / px.
+    crpix : (2,) ndarray
+        Present reference point, px, zero based.
+    image_shape : (int, int)
+        Shape of the detector, (ny, nx).
+
+    Returns
+    -------
+    cd, crpix : ndarray
+        The new ones, with ``U = M U' + t`` between the old and the new coordinates.
+    matrix : (2, 2) ndarray
+        M.
+    offset : (2,) ndarray
+        t, deg.
+
+    Notes
+    -----
+    The sum of the fourth powers of the errors over a grid is made small, which is nearly their
+    greatest one.
+    """
+    ny, nx = image_shape
+    x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, _NODES), np.linspace(-0.5, ny - 0.5, _NODES))
+    u = cd @ (np.array([x.ravel(), y.ravel()]) - np.reshape(crpix, (2, 1)))
+    plane = np.array(pv(*u))
+    pixel = np.sqrt(abs(np.linalg.det(cd)))
+    # Changes of a hundredth of the matrix, and of a thousandth of the detector.
+    steps = np.array([1e-2] * 4 + [1e-3 * max(nx, ny) * pixel] * 2)
+
+    def parts(changes):
+        changes = changes * steps
+        return np.eye(2) + changes[:4].reshape(2, 2), changes[4:]
+
+    def squares(changes):
+        matrix, offset = parts(changes)
+        shifted = offset[:, np.newaxis]
+        end = matrix @ _steps(lambda *w: pv(*(matrix @ w + shifted)), plane) + shifted
+        return ((end - u) ** 2).sum(axis=0)
+
+    start = np.zeros(6)
+    worst = squares(start).max()
+    found = least_squares(lambda p: squares(p) / worst, start, max_nfev=_MOST_EVALUATIONS)
+    matrix, offset = parts(found.x)
+    return np.linalg.solve(matrix, cd), crpix + np.linalg.solve(cd, offset), matrix, offset
+
+
+def _steps(pv, plane):
+    u = plane
+    for _ in range(_STEPS):
+        u = u - (np.array(pv(*u)) - plane)
+    return u

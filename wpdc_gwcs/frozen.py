@@ -1,0 +1,127 @@
+"""Values that cannot be changed: what results are made of."""
+
+import copy
+
+import numpy as np
+
+__all__ = ["FrozenDict", "freeze", "freeze_attributes", "frozen_array", "with_statistics"]
+
+
+class FrozenDict(dict):
+    """A dictionary that cannot be changed; ``dict(d)`` and ``d | {...}`` give one that can.
+
+    It is a `dict`, unlike `types.MappingProxyType`, so that it goes wherever one goes: through a
+    pickle to other processes, into JSON, into a copy.
+    """
+
+    def _refuse(self, *_, **__):
+        raise TypeError(
+            "what a result says cannot be changed; dataclasses.replace makes another result"
+        )
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    clear = pop = popitem = setdefault = update = _refuse
+
+    def __reduce__(self):
+        return type(self), (dict(self),)
+
+
+def freeze(value):
+    """Give a value that cannot be changed, with all that is in it.
+
+    Parameters
+    ----------
+    value : object
+        Dictionaries, lists, tuples and arrays within each other; all else is taken as it is.
+
+    Returns
+    -------
+    frozen : object
+        `FrozenDict`, tuple, or array that cannot be written to, of its own.
+    """
+    if isinstance(value, FrozenDict):
+        return value
+    if isinstance(value, dict):
+        return FrozenDict({key: freeze(one) for key, one in value.items()})
+    if type(value) in (list, tuple):
+        return tuple(map(freeze, value))
+    if isinstance(value, np.ndarray):
+        value = np.array(value)
+        value.flags.writeable = False
+    return value
+
+
+def frozen_array(owner, name, *, shape=None, dtype=float, finite=True):
+    """Turn an attribute of a frozen object into an array of its own that cannot be written to.
+
+    Parameters
+    ----------
+    owner : object
+        Frozen dataclass; an attribute that is `None` is left alone.
+    name : str
+        Name of the attribute.
+    shape : tuple of int or None, optional
+        Shape that it must have; `None` in it for any size.
+    dtype : type, optional
+        Type of the values.
+    finite : bool, optional
+        Whether NaN and infinity are refused.
+
+    Returns
+    -------
+    ndarray or None
+        The array.
+
+    Raises
+    ------
+    ValueError
+        If the shape or a value is not allowed.
+    """
+    value = getattr(owner, name)
+    if value is None:
+        return None
+    value = np.array(value, dtype=dtype)
+    if shape is not None and (
+        value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape))
+    ):
+        raise ValueError(f"{name} must have the shape {shape}, got {value.shape}")
+    if finite and not np.isfinite(value).all():
+        raise ValueError(f"{name} must be finite, got {value.tolist()}")
+    value.flags.writeable = False
+    object.__setattr__(owner, name, value)
+    return value
+
+
+def freeze_attributes(owner, *names):
+    """Freeze attributes of a frozen dataclass.
+
+    Parameters
+    ----------
+    owner : object
+        The dataclass.
+    *names : str
+        Names of the attributes.
+    """
+    for name in names:
+        object.__setattr__(owner, name, freeze(getattr(owner, name)))
+
+
+def with_statistics(result, **entries):
+    """Give the same result with more statistics.
+
+    Parameters
+    ----------
+    result : dataclass instance
+        Calibration or solution.
+    **entries : object
+        To be added to its ``statistics``.
+
+    Returns
+    -------
+    result : dataclass instance
+        A new one; unlike that of `dataclasses.replace` it keeps the WCS that was built already,
+        which does not depend on statistics.
+    """
+    new = copy.copy(result)
+    object.__setattr__(new, "statistics", freeze({**result.statistics, **entries}))
+    return new
