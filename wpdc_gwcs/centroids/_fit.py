@@ -365,7 +365,7 @@ def star_like(flux, chi2, valid, *, limit=2.5, width=31):
     return result
 
 
-def estimate_noise(field, profile, noise, stars, *, radius, gain=None):
+def estimate_noise(field, profile, noise, stars, *, radius, gain=None, modes=()):
     """Learn from residuals of well measured stars how far the profile is off, and the gain.
 
     Parameters
@@ -374,6 +374,8 @@ def estimate_noise(field, profile, noise, stars, *, radius, gain=None):
         As for `fit_stars`; stars where the fit has converged.
     gain : float, optional
         Electrons per count; estimated if not given.
+    modes : sequence of Profile, optional
+        Changes of the profile that each star may have for its own: what they take up is no error.
 
     Returns
     -------
@@ -388,16 +390,24 @@ def estimate_noise(field, profile, noise, stars, *, radius, gain=None):
     model = flux[:, None] * basis[0]
     use &= model > np.sqrt(sky.variance)
     weight = use / noise.variance(sky, model)
-    jacobian = np.stack([flux[:, None] * b for b in basis[1:]] + [basis[0]], axis=1)
+    one = np.ones((len(flux), 1))
+    own = [m.evaluate(stars.x - xc, stars.y - yc, half, one, gradient=False)[0] for m in modes]
+    jacobian = np.stack([flux[:, None] * b for b in (*basis[1:], *own)] + [basis[0]], axis=1)
+    n = jacobian.shape[1]
     normal = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
-    good = use.sum(axis=1) >= 6
-    normal[~good] = np.eye(3)
+    good = use.sum(axis=1) >= 2 * n
+    normal[~good] = np.eye(n)
     # A fit takes part of the scatter away, most where few pixels decide: the leverage.
-    leverage = weight * np.einsum("sip,sij,sjp->sp", jacobian, np.linalg.pinv(normal), jacobian)
+    inverse = np.linalg.pinv(normal)
+    leverage = weight * np.einsum("sip,sij,sjp->sp", jacobian, inverse, jacobian)
+    residual = pixels - model
+    if own:
+        step = inverse @ (jacobian @ (weight * residual)[:, :, None])
+        residual = residual - (step.transpose(0, 2, 1) @ jacobian)[:, 0]
     use &= good[:, None] & (leverage < 0.8)
     if np.count_nonzero(use) < 50:
         return replace(noise, inverse_gain=0.0 if gain is None else 1 / gain)
-    residual2 = ((pixels - model) ** 2)[use] / (1 - leverage[use])
+    residual2 = (residual**2)[use] / (1 - leverage[use])
     square = (model * model.max(axis=1, keepdims=True))[use]
     photons, sky = (model * sky.photons)[use], sky.variance[use]
     order = np.argsort(square)

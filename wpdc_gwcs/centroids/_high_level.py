@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from wpdc_gwcs.centroids._blends import judge_profiles, weigh_neighbors
 from wpdc_gwcs.centroids._build import (
     OVERSAMPLING,
     fit_moffat,
+    isolated,
     learn_profile,
     select_stars,
     vary_profile,
@@ -23,9 +25,10 @@ from wpdc_gwcs.centroids._fit import (
     render,
     star_like,
 )
+from wpdc_gwcs.centroids._modes import blur_modes, mode_profiles
 from wpdc_gwcs.centroids._profile import Profile, moffat_samples, spline_coefficients
 from wpdc_gwcs.exceptions import CentroidWarning
-from wpdc_gwcs.flags import FLAG_FIT_FAILED
+from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EXTENDED, FLAG_FIT_FAILED, FLAG_SATURATED
 from wpdc_gwcs.selection import select_sources
 from wpdc_gwcs.threads import one_blas_thread
 
@@ -36,6 +39,7 @@ log = logging.getLogger(__name__)
 # Stars whose residuals tell the error of the PSF.
 _MAX_STARS = 1000
 _MIN_STARS = 8
+_ENOUGH_ALONE = 50
 # Reduced chi square, absolute and relative to that of sources as bright, from which a source is
 # not a star.
 _MAX_CHI2 = 4.0
@@ -44,12 +48,20 @@ _TOLERATED_CHI2 = 1.5
 # Light of neighbors, in standard deviations of the sky, that does not matter to a fit.
 _NEGLIGIBLE = 0.05
 _CHUNK = 10_000
+# Relative error of a neighbor's light beside its core: what any PSF is known to at best, what that
+# of a saturated star is, whose flux comes from its wings, and that of a source that has no model.
+_LEAST_ERROR, _SATURATED_ERROR, _NO_MODEL = 0.02, 0.2, 1.0
+# A star is blended where its neighbors cost it more than this many times the error it would have
+# alone, and more than so many px.
+_MAX_COST, _TOLERATED_COST = 1.5, 0.01
 # Error of the PSF, relative, below which a residual is no sign of another star.
 _MODEL_ERROR = 0.1
 # Error of the PSF, relative, up to which it is as smooth as its width tells; and the FWHM in px of
 # the finest structure looked for otherwise.
 _FAIR_MISMATCH = 0.03
 _FINEST = 1.4
+# Share of broad stars that is not chance.
+_BROAD_SHARE = 0.04
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
 
@@ -144,6 +156,11 @@ def _learn(field, stars, fwhm, gain, vary):
     options = {"fwhm": fwhm, "radius": radius, "gain": gain}
     chosen = stars
     profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=4, **options)
+    broad, _ = judge_profiles(field, profile, noise, stars, stars.flux > 0, fwhm, radius)
+    if broad.mean() > _BROAD_SHARE and np.count_nonzero(~broad) >= _MIN_STARS:
+        # Hidden companions have made the profile broader.
+        chosen = stars.take(~broad)
+        profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=2, **options)
     finest = fwhm
     while noise.mismatch > _FAIR_MISMATCH and finest > 2 * _FINEST:
         # Rings and trails have edges that are finer than they are wide.
@@ -218,8 +235,11 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3, refit
         \sigma^2 = \sigma_\mathrm{sky}^2 + f \psi / g
                    + \epsilon^2 f^2 \psi \psi_\mathrm{max} .
 
-    The errors are those of the inverse of the normal matrix, times
-    :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1.
+    The errors are those of all stars fitted together: of the normal matrix with the neighbors
+    eliminated, times :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1, and what is wrong in the
+    models of the neighbors besides.  Where neighbors cost a star more than half of its error and
+    more than 0.01 px, `wpdc_gwcs.detection.FLAG_BLENDED` is set, and it is cleared elsewhere; where
+    the profile is broader than those of other stars, `wpdc_gwcs.detection.FLAG_EXTENDED`.
 
     Examples
     --------
@@ -245,13 +265,14 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3, refit
     fwhm = _typical_fwhm(sources)
     stars = _stars_of(sources, unit)
     quality = select_sources(sources)
-    fits = _fit(field, profile, stars, quality, fwhm, _per_unit(gain, unit), passes, refit)
     flags = (
         np.array(sources["flags"], int)
         if "flags" in sources.colnames
         else np.zeros(len(stars.x), int)
     )
-    return _fitted_table(sources, fits, flags, fwhm, unit)
+    gain = _per_unit(gain, unit)
+    fits, shift, flags = _fit(field, profile, stars, quality, flags, fwhm, gain, passes, refit)
+    return _fitted_table(sources, fits, shift, flags, fwhm, unit)
 
 
 @one_blas_thread
@@ -349,18 +370,25 @@ def _noise_of(field, profile, stars, quality, fwhm, gain):
     """Noise by the residuals of the brightest stars of good quality, and how many they are."""
     radius = _fit_radius(fwhm)
     noise = Noise(0.0 if gain is None else 1 / gain, 0.02)
-    candidates = np.flatnonzero(quality & (stars.flux > 0))
+    good = quality & (stars.flux > 0)
+    # Neighbors' light is no noise, if enough stars have none.
+    alone = good & isolated(stars, fwhm)
+    candidates = np.flatnonzero(alone if alone.sum() >= _ENOUGH_ALONE else good)
     candidates = candidates[np.argsort(stars.flux[candidates])[::-1][:_MAX_STARS]]
     fits = fit_stars(field, profile, noise, stars.take(candidates), radius=radius)
     clean = star_like(fits.stars.flux, fits.chi2, fits.valid)
-    noise = estimate_noise(field, profile, noise, fits.stars.take(clean), radius=radius, gain=gain)
+    # A star that is a little broader or sharper than others has no worse position.
+    blur = blur_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)
+    options = {"radius": radius, "gain": gain}
+    options["modes"] = mode_profiles(blur[:3], profile.oversampling)
+    noise = estimate_noise(field, profile, noise, fits.stars.take(clean), **options)
     log.info("noise of the fits: %s", noise)
     return noise, int(clean.sum())
 
 
 @one_blas_thread
-def _fit(field, profile, stars, quality, fwhm, gain, passes, refit):
-    """Fits of all stars; those of good quality tell the noise."""
+def _fit(field, profile, stars, quality, flags, fwhm, gain, passes, refit):
+    """Fits of all stars, errors by neighbors, flags; those of good quality tell the noise."""
     radius = _fit_radius(fwhm)
     noise, _ = _noise_of(field, profile, stars, quality, fwhm, gain)
     if refit:
@@ -376,7 +404,31 @@ def _fit(field, profile, stars, quality, fwhm, gain, passes, refit):
         work = replace(field, image=np.subtract(field.image, model, out=model))
         again = fit_stars(work, profile, noise, own.take(rows), radius=radius, own=own.take(rows))
         fits = fits.updated(rows, again)
-    return fits
+    return _judge_neighbors(field, profile, noise, fits, stars, flags, fwhm)
+
+
+def _judge_neighbors(field, profile, noise, fits, start, flags, fwhm):
+    """Fits with the covariance of all stars together, errors by neighbors, flags of blends."""
+    radius = _fit_radius(fwhm)
+    model, own = _model_of(field, profile, fits, start, fwhm)
+    residual = replace(field, image=np.subtract(field.image, model, out=model))
+    fitted = own.flux > 0
+    broad, excess = judge_profiles(
+        residual, profile, noise, own, fitted, fwhm, radius, subtracted=True
+    )
+    unsure = np.where(flags & FLAG_SATURATED, _SATURATED_ERROR, max(_LEAST_ERROR, noise.mismatch))
+    all_light = own._replace(flux=np.where(fitted, own.flux, np.maximum(start.flux, 0)))
+    alone = np.where(fitted[:, None, None], fits.covariance, np.nan)
+    joint, shift = weigh_neighbors(
+        field, profile, noise, all_light, alone, radius, np.where(fitted, unsure, _NO_MODEL)
+    )
+    before, after = (np.sqrt(c[:, 0, 0] + c[:, 1, 1]) for c in (alone, joint))
+    error = np.hypot(after, shift)
+    blended = ~(error < np.maximum(_MAX_COST * before, _TOLERATED_COST)) & fitted
+    flags = np.where(fitted, flags & ~FLAG_BLENDED, flags)
+    flags |= np.where(blended, FLAG_BLENDED, 0) | np.where(broad, FLAG_EXTENDED, 0)
+    joint = np.where(np.isfinite(joint), joint, alone)
+    return replace(fits, covariance=joint, chi2=fits.chi2 - excess), shift, flags
 
 
 def _model_of(field, profile, fits, stars, fwhm):
@@ -412,7 +464,7 @@ def _near(stars, start, fwhm):
     return np.hypot(stars.x - start.x, stars.y - start.y) < max(0.5 * fwhm, 1.0)
 
 
-def _fitted_table(sources, fits, flags, fwhm, unit):
+def _fitted_table(sources, fits, shift, flags, fwhm, unit):
     """Copy of the sources with the results of the fits, in counts."""
     result = sources.copy()
     good = fits.valid & _near(fits.stars, _stars_of(sources, unit), fwhm)
@@ -421,6 +473,7 @@ def _fitted_table(sources, fits, flags, fwhm, unit):
         snr = fits.stars.flux / error[:, 2]
         # Beyond chance, a high chi square is an unseen neighbor or a PSF that does not fit.
         error *= np.sqrt(np.maximum(fits.chi2 / _TOLERATED_CHI2, 1))[:, None]
+    error[:, :2] = np.hypot(error[:, :2], shift[:, None] / np.sqrt(2))
     columns = {
         "x": fits.stars.x,
         "y": fits.stars.y,
