@@ -7,8 +7,9 @@ from numpy.polynomial.legendre import legvander
 from scipy.linalg import LinAlgError, solveh_banded
 from scipy.spatial import KDTree
 
-from wpdc_gwcs.centroids._fit import estimate_noise, fit_stars, star_like
+from wpdc_gwcs.centroids._fit import fit_stars, star_like
 from wpdc_gwcs.centroids._modes import blur_modes, reduced_normal
+from wpdc_gwcs.centroids._noise import bin_noise, estimate_noise
 from wpdc_gwcs.centroids._profile import (
     Profile,
     moffat_samples,
@@ -202,7 +203,8 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
         stars = fits.stars.take(star_like(fits.stars.flux, fits.chi2, fits.valid))
         if len(stars.x) == 0:
             break
-        noise = estimate_noise(field, profile, noise, stars, radius=radius, gain=gain)
+        bins = bin_noise(field, profile, noise, stars, radius=radius)
+        noise = estimate_noise(bins, gain)
         # A profile is never known better, and the brightest stars must not rule alone.
         noise = replace(noise, mismatch=float(np.clip(noise.mismatch, 0.003, 0.3)))
         change = _residual_coefficients(field, noise, start, stars, fwhm, finest or fwhm)

@@ -17,15 +17,14 @@ from wpdc_gwcs.centroids._build import (
 )
 from wpdc_gwcs.centroids._fit import (
     Field,
-    Noise,
     StarFits,
     Stars,
-    estimate_noise,
     fit_stars,
     render,
     star_like,
 )
 from wpdc_gwcs.centroids._modes import blur_modes, mode_profiles
+from wpdc_gwcs.centroids._noise import Noise, bin_noise, estimate_noise, least_gain
 from wpdc_gwcs.centroids._profile import Profile, moffat_samples, spline_coefficients
 from wpdc_gwcs.exceptions import CentroidWarning
 from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EXTENDED, FLAG_FIT_FAILED, FLAG_SATURATED
@@ -40,6 +39,8 @@ log = logging.getLogger(__name__)
 _MAX_STARS = 1000
 _MIN_STARS = 8
 _ENOUGH_ALONE = 50
+# Share of the noise in stars that must be that of their photons to tell the gain.
+_LEAST_PHOTONS = 0.1
 # Reduced chi square, absolute and relative to that of sources as bright, from which a source is
 # not a star.
 _MAX_CHI2 = 4.0
@@ -236,10 +237,10 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3, refit
                    + \epsilon^2 f^2 \psi \psi_\mathrm{max} .
 
     The errors are those of all stars fitted together: of the normal matrix with the neighbors
-    eliminated, times :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1, and what is wrong in the
-    models of the neighbors besides.  Where neighbors cost a star more than half of its error and
-    more than 0.01 px, `wpdc_gwcs.detection.FLAG_BLENDED` is set, and it is cleared elsewhere; where
-    the profile is broader than those of other stars, `wpdc_gwcs.detection.FLAG_EXTENDED`.
+    eliminated, times :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1, and what is wrong in
+    the models of the neighbors besides.  Where neighbors cost a star more than half of its error
+    and more than 0.01 px, `wpdc_gwcs.detection.FLAG_BLENDED` is set, and it is cleared elsewhere;
+    where the profile is broader than those of other stars, `wpdc_gwcs.detection.FLAG_EXTENDED`.
 
     Examples
     --------
@@ -318,7 +319,10 @@ class StarNoise:
     Parameters
     ----------
     gain : float
-        Electrons per count by which the noise grows with the stars' light.
+        Electrons per count by which the noise grows with the stars' light; NaN where errors of the
+        PSF hide it.
+    least_gain : float
+        Gain below which the photons alone would make more noise than there is, 0 if unknown.
     mismatch : float
         Error of the PSF at its peak, relative to its value there.
     n_stars : int
@@ -326,6 +330,7 @@ class StarNoise:
     """
 
     gain: float
+    least_gain: float
     mismatch: float
     n_stars: int
 
@@ -352,7 +357,8 @@ def measure_noise(data, sources, epsf, *, error=None):
 
     Notes
     -----
-    The PSF has taken some of the stars' noise into it: the gain comes out up to a third too high.
+    A PSF that was made from the same stars has taken some of their noise into it, and the gain
+    comes out up to a third too high; from one that was made from other stars it is right.
 
     Examples
     --------
@@ -362,14 +368,19 @@ def measure_noise(data, sources, epsf, *, error=None):
     fwhm = _typical_fwhm(sources)
     stars = _stars_of(sources, unit)
     quality = select_sources(sources)
-    noise, n = _noise_of(field, _from_photutils(epsf), stars, quality, fwhm, None)
-    return StarNoise(1 / max(noise.inverse_gain * unit, 1e-300), noise.mismatch, n)
+    bins, n = _noise_bins(field, _from_photutils(epsf), stars, quality, fwhm, None)
+    noise = estimate_noise(bins)
+    gain = np.nan
+    if bins is not None:
+        photons = np.median(noise.inverse_gain * bins.photons / bins.measured)
+        gain = 1 / (noise.inverse_gain * unit) if photons > _LEAST_PHOTONS else np.nan
+    return StarNoise(float(gain), least_gain(bins) / unit, noise.mismatch, n)
 
 
-def _noise_of(field, profile, stars, quality, fwhm, gain):
-    """Noise by the residuals of the brightest stars of good quality, and how many they are."""
+def _noise_bins(field, profile, stars, quality, fwhm, gain):
+    """Noise in the brightest stars of good quality, and how many they are."""
     radius = _fit_radius(fwhm)
-    noise = Noise(0.0 if gain is None else 1 / gain, 0.02)
+    noise = Noise(0.0 if gain is None else 1 / gain)
     good = quality & (stars.flux > 0)
     # Neighbors' light is no noise, if enough stars have none.
     alone = good & isolated(stars, fwhm)
@@ -379,18 +390,17 @@ def _noise_of(field, profile, stars, quality, fwhm, gain):
     clean = star_like(fits.stars.flux, fits.chi2, fits.valid)
     # A star that is a little broader or sharper than others has no worse position.
     blur = blur_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)
-    options = {"radius": radius, "gain": gain}
-    options["modes"] = mode_profiles(blur[:3], profile.oversampling)
-    noise = estimate_noise(field, profile, noise, fits.stars.take(clean), **options)
-    log.info("noise of the fits: %s", noise)
-    return noise, int(clean.sum())
+    modes = mode_profiles(blur[:3], profile.oversampling)
+    bins = bin_noise(field, profile, noise, fits.stars.take(clean), radius=radius, modes=modes)
+    return bins, int(clean.sum())
 
 
 @one_blas_thread
 def _fit(field, profile, stars, quality, flags, fwhm, gain, passes, refit):
     """Fits of all stars, errors by neighbors, flags; those of good quality tell the noise."""
     radius = _fit_radius(fwhm)
-    noise, _ = _noise_of(field, profile, stars, quality, fwhm, gain)
+    noise = estimate_noise(_noise_bins(field, profile, stars, quality, fwhm, gain)[0], gain)
+    log.info("noise of the fits: %s", noise)
     if refit:
         fits = StarFits.unfitted(stars)
     else:

@@ -49,6 +49,7 @@ from wpdc_gwcs.io.headers import (
 from wpdc_gwcs.io.images import (
     choose_plane,
     image_gain,
+    image_read_noise,
     image_saturation,
     image_shape,
     load_image,
@@ -406,6 +407,7 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
         epoch=header_epoch(headers, name=where),
         source=where,
         gain=image_gain(headers),
+        read_noise=image_read_noise(headers),
         saturation=image_saturation(headers),
         **_keys_of(headers, exposure_keyword, where),
         meta=_facts(headers) | _choices(part),
