@@ -20,8 +20,8 @@ _NEAREST, _BEST = 25, 300
 _LEAST = 20
 # Variance of a median over that of a mean.
 _MEDIAN_COST = 1.57
-# Hits are narrower than any star, by so many median absolute widths.
-_OUTLIER = 6.0
+# Outliers, in median absolute widths; and so few that both sides are needed.
+_OUTLIER, _FEW = 6.0, 60
 
 
 def weigh_neighbors(field, profile, noise, stars, covariance, radius, unsure):
@@ -113,7 +113,7 @@ def _inverse(normal):
     return inverse
 
 
-def judge_profiles(field, profile, noise, stars, valid, fwhm, radius, *, subtracted=False):
+def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtracted=False):
     r"""Compare the profiles of stars with that of the frame: broader than their like, or as they.
 
     Parameters
@@ -121,9 +121,9 @@ def judge_profiles(field, profile, noise, stars, valid, fwhm, radius, *, subtrac
     field, profile, noise, radius
         As for `fit_stars`.
     stars : Stars
-        The stars as fitted.
-    valid : (N,) ndarray of bool
-        True where the fit converged.
+        The stars as fitted; those without a fit have no flux.
+    clean : (N,) ndarray of bool
+        True for those that may tell what stars have in common.
     fwhm : float
         FWHM in px.
     subtracted : bool, optional
@@ -146,8 +146,9 @@ def judge_profiles(field, profile, noise, stars, valid, fwhm, radius, *, subtrac
     because the PSF does not follow) shows in those that are narrower, which no companion makes.
     """
     broad, excess = np.zeros(len(stars.x), bool), np.zeros(len(stars.x))
-    rows = np.flatnonzero(valid)
-    if len(rows) < _LEAST:
+    rows = np.flatnonzero(stars.flux > 0)
+    clean = np.flatnonzero(clean[rows])
+    if len(clean) < _LEAST:
         return broad, excess
     stars = stars.take(rows)
     modes = blur_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)[:3]
@@ -160,7 +161,7 @@ def judge_profiles(field, profile, noise, stars, valid, fwhm, radius, *, subtrac
     covariance = np.linalg.pinv(left)
     amplitude = np.einsum("sij,sj->si", covariance, right)
     before = np.einsum("si,sij,sj->s", amplitude, left, amplitude)
-    best = np.argsort(covariance.trace(axis1=1, axis2=2))
+    best = clean[np.argsort(covariance[clean].trace(axis1=1, axis2=2))]
     best = best[: int(np.clip(len(best) // 4, _LEAST, _BEST))]
     common, unsure = _common(stars, amplitude, covariance, best)
     amplitude -= common
@@ -201,13 +202,13 @@ def _differences(amplitude, covariance):
     """Covariance (3, 3) of how profiles differ from star to star.
 
     By color, brightness or a place that the PSF does not follow.  Those stars tell that are
-    narrower than usual, which no companion makes.
+    narrower than usual, which no companion makes; of few stars all do, since the brightest of them
+    make the PSF.
     """
     width = amplitude[:, 0] + amplitude[:, 2]
-    usual = width > -_OUTLIER * np.median(np.abs(width))
-    narrower = (width <= 0) & usual
-    if narrower.sum() < _LEAST // 2:
-        return np.zeros((3, 3))
-    seen = np.einsum("si,sj->ij", amplitude[narrower], amplitude[narrower]) / narrower.sum()
-    sizes, axes = np.linalg.eigh(seen - covariance[narrower].mean(axis=0))
+    told = np.abs(width) < _OUTLIER * np.median(np.abs(width))
+    if len(width) > _FEW:
+        told &= width <= 0
+    seen = np.einsum("si,sj->ij", amplitude[told], amplitude[told]) / max(told.sum(), 1)
+    sizes, axes = np.linalg.eigh(seen - covariance[told].mean(axis=0))
     return (axes * np.maximum(sizes, 0)) @ axes.T

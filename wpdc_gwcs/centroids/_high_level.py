@@ -423,8 +423,9 @@ def _judge_neighbors(field, profile, noise, fits, start, flags, fwhm):
     model, own = _model_of(field, profile, fits, start, fwhm)
     residual = replace(field, image=np.subtract(field.image, model, out=model))
     fitted = own.flux > 0
+    clean = (flags == 0) & star_like(own.flux, fits.chi2, fitted, limit=_MAX_CHI2)
     broad, excess = judge_profiles(
-        residual, profile, noise, own, fitted, fwhm, radius, subtracted=True
+        residual, profile, noise, own, clean, fwhm, radius, subtracted=True
     )
     unsure = np.where(flags & FLAG_SATURATED, _SATURATED_ERROR, max(_LEAST_ERROR, noise.mismatch))
     all_light = own._replace(flux=np.where(fitted, own.flux, np.maximum(start.flux, 0)))
