@@ -244,6 +244,7 @@ def write_file(path, data, **cards):
         ("c4d_1_ooi_g.fits", "c4d_1_oow_g.fits", "weight"),
         ("x.fits", "x_bad_pixel_map.fits", "mask"),
         ("x-7.fits", "x-7-rms.fits", "error"),
+        ("x.fits", "x_conf.fits", "weight"),
     ],
 )
 @pytest.mark.parametrize("order", [1, -1])

@@ -73,7 +73,7 @@ def test_cluster_is_matched_whatever_the_faintest_source(seed):
     magnitude = 15 + 10 * rng.power(2.5, len(stars))
     snr = 10 ** (0.4 * (24.0 - magnitude))
     # Crowding loses stars in the core, most of them faint ones.
-    lost = 0.6 * np.exp(-(np.hypot(*(stars - SIDE / 2).T) / 400) ** 2) + 0.03
+    lost = 0.6 * np.exp(-((np.hypot(*(stars - SIDE / 2).T) / 400) ** 2)) + 0.03
     seen = (rng.random(len(stars)) > lost) & (snr > 3)
     u = (stars - SIDE / 2) / SIDE
     bent = stars + 60 * u * (u**2).sum(axis=1, keepdims=True) + [9.0, -5.0]

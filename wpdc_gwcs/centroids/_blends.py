@@ -12,9 +12,13 @@ _REACH = 1.8
 # Pairs at a time: bounds the memory for their pixels.
 _CHUNK = 20_000
 
-# Significance in sigma of the broadening along the direction where it is greatest, which two stars
-# in a hundred exceed by noise, of any profile; and the directions tried.
-_MAX_BROADENING, _N_DIRECTIONS = 2.7, 12
+# Significance in sigma of the broadening along the direction where it is greatest, which one star
+# in a hundred exceeds by noise, of any profile.  Where the width is known better than the next
+# number, it is that times the fourth root of how much better: companions of a bright star show far
+# beyond, and bright stars are few.  Where it is known worse than the last one, none show.
+_MAX_BROADENING, _KNOWN, _UNKNOWN = 3.0, 0.025, 0.055
+# Directions tried.
+_N_DIRECTIONS = 12
 # Stars nearest in place, and the best measured of all, that tell how profiles differ.
 _NEAREST, _BEST = 25, 300
 _LEAST = 20
@@ -175,7 +179,9 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     significance = np.einsum("si,sid->sd", amplitude, pushed) / np.sqrt(
         np.maximum(np.einsum("id,sid->sd", along, pushed), 1e-300)
     )
-    broad[rows] = significance.max(axis=1) > _MAX_BROADENING
+    width = np.sqrt(0.5 * (covariance[:, 0, 0] + covariance[:, 2, 2]))
+    limit = _MAX_BROADENING * np.maximum(_KNOWN / np.maximum(width, 1e-9), 1) ** 0.25
+    broad[rows] = (significance.max(axis=1) > limit) & (width < _UNKNOWN)
     return broad, excess
 
 
