@@ -5,7 +5,7 @@ import pytest
 from astropy.io import fits
 
 from wpdc_gwcs.exceptions import FrameError, WPDCWarning
-from wpdc_gwcs.io import read_frames
+from wpdc_gwcs.io import read_files, read_frames
 
 SHAPE = (200, 240)
 
@@ -226,3 +226,77 @@ class TestPlanes:
 def test_gain_is_that_of_the_unit(tmp_path, sky, cards, gain):
     fits.writeto(tmp_path / "a.fits", sky, header(**cards))
     assert read_frames(tmp_path / "a.fits")[0].gain == gain
+
+
+def write_file(path, data, **cards):
+    fits.PrimaryHDU(data, header(**cards)).writeto(path)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("frame", "other", "role"),
+    [
+        ("x.fits", "x.weight.fits", "weight"),
+        ("x.fits", "x_mask.fits", "mask"),
+        ("x.fits", "bpm_x.fits", "mask"),
+        ("n1.image.fits", "n1.invvar.fits", "weight"),
+        ("c4d_1_ooi_g.fits", "c4d_1_ood_g.fits", "mask"),
+        ("c4d_1_ooi_g.fits", "c4d_1_oow_g.fits", "weight"),
+        ("x.fits", "x_bad_pixel_map.fits", "mask"),
+        ("x-7.fits", "x-7-rms.fits", "error"),
+        ("x.fits", "x_conf.fits", "weight"),
+    ],
+)
+@pytest.mark.parametrize("order", [1, -1])
+def test_maps_in_files_beside_are_no_frames(tmp_path, sky, hot, frame, other, role, order):
+    data = (hot * 4).astype("i2") if role == "mask" else np.where(hot, 0, 2).astype("f4")
+    paths = [write_file(tmp_path / frame, sky), write_file(tmp_path / other, data)]
+    alone = write_file(tmp_path / "y.fits", sky)
+    frames = read_files([*paths[::order], alone])
+    assert sorted(f.source for f in frames) == sorted([paths[0], alone])
+    found = next(f for f in frames if f.source == paths[0])
+    assert found.inputs == (paths[1],)
+    bad = found.load_mask() if role == "mask" else found.load_weight() == 0
+    np.testing.assert_array_equal(bad, hot)
+    assert next(f for f in frames if f.source == alone).load_mask is None
+
+
+@pytest.mark.parametrize(
+    ("other", "cards"),
+    [
+        ("x_mask.fits", {"CRVAL1": 151.0}),
+        ("x_weight.fits", {"DATE-OBS": "2020-01-02"}),
+        ("x_std.fits", {}),
+        ("x_2.fits", {}),
+    ],
+)
+def test_other_exposures_are_frames_whatever_their_names(tmp_path, sky, other, cards):
+    day = {"DATE-OBS": "2020-01-01"}
+    one = write_file(tmp_path / "x.fits", sky, **day)
+    two = write_file(tmp_path / other, sky, **(day | cards))
+    assert [f.source for f in read_files([one, two])] == [one, two]
+
+
+def test_maps_of_several_detectors_and_those_that_are_given(tmp_path, sky, hot):
+    def camera(name, planes):
+        hdus = [fits.PrimaryHDU()]
+        for k, data in enumerate(planes, start=1):
+            hdus.append(fits.ImageHDU(data, header(CRPIX1=300.0 * k), name=f"N{k}"))
+        fits.HDUList(hdus).writeto(tmp_path / name)
+        return str(tmp_path / name)
+
+    masks = [np.roll(hot, k, axis=0).astype("u1") for k in (0, 1)]
+    paths = [camera("x.fits", [sky, sky + 1]), camera("x.flag.fits", masks)]
+    frames = read_files(paths)
+    assert len(frames) == 2
+    for frame, mask in zip(frames, masks, strict=True):
+        np.testing.assert_array_equal(frame.load_mask(), mask > 0)
+    none = camera("none.fits", [0 * masks[0], 0 * masks[1]])
+    for frame in read_files(paths, mask=none):
+        assert not frame.load_mask().any()
+        assert frame.inputs == (none,)
+
+
+def test_a_mask_without_its_frame_is_left_to_the_user(tmp_path, sky):
+    alone = write_file(tmp_path / "x.weight.fits", sky)
+    assert [f.source for f in read_files([alone])] == [alone]

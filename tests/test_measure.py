@@ -1,6 +1,7 @@
 """Frames of any unit, gain and shape of the stars are measured alike."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from wpdc_gwcs.calibration import Settings, measure_sources
 from wpdc_gwcs.calibration.measure import quality_of
 from wpdc_gwcs.detection import mask_hits, subtract_background
 from wpdc_gwcs.exceptions import WPDCWarning
+from wpdc_gwcs.flags import FLAG_SATURATED
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.selection import select_sources
 
@@ -205,3 +207,44 @@ def test_quality_of_a_frame(plain):
     assert quality["mismatch"] < 0.03
     assert "sources left out" in quality["left_out"]
     assert np.isnan(quality_of(frame, None, Settings())["fwhm"])
+
+
+def test_gain_is_tested_against_the_read_noise(plain):
+    """Sums of ten seconds, given per second: half an electron of noise would not be impossible."""
+    image, *_ = plain
+    rate = image / 10
+    kept = replace(frame_of(rate, gain=GAIN * 10), read_noise=2.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        measure_sources(kept)
+    with pytest.warns(WPDCWarning, match="that of the readout alone is 8"):
+        found = measure_sources(replace(frame_of(rate, gain=GAIN), read_noise=8.0))
+    assert found.meta["gain"] == pytest.approx(10 * GAIN, rel=0.3)
+
+
+def test_pixels_cut_off_below_the_stated_saturation(plain):
+    image, *_ = plain
+    top = 0.3 * image.max()
+    with pytest.warns(WPDCWarning, match="saturation of 65535 .* are cut off at"):
+        sources = measure_sources(frame_of(np.minimum(image, top), saturation=65535.0))
+    assert sources.meta["saturation"] == pytest.approx(top, rel=0.01)
+    assert np.any(np.asarray(sources["flags"]) & FLAG_SATURATED)
+
+
+def test_a_psf_that_does_not_fit_is_no_proof_against_a_gain():
+    """Stars of many widths scatter more than photons do, on a sky that was subtracted."""
+    rng = np.random.default_rng(8)
+    x, y = (v.ravel() + rng.uniform(-3, 3, v.size) for v in np.mgrid[20:492:22, 20:492:22])
+    yy, xx = np.mgrid[:512, :512]
+    image = np.zeros((512, 512))
+    for x0, y0, f in zip(x, y, 10 ** rng.uniform(3.3, 5.0, x.size), strict=True):
+        k = np.s_[max(int(y0) - 12, 0) : int(y0) + 13, max(int(x0) - 12, 0) : int(x0) + 13]
+        lump = 1 + 0.04 * rng.normal(size=image[k].shape)  # response within pixels
+        r2 = (xx[k] - x0) ** 2 + (yy[k] - y0) ** 2
+        image[k] += f / (2 * np.pi * 1.44) * np.exp(-r2 / 2 / 1.44) * lump
+    sky = 800.0
+    image = rng.poisson((image + sky) * GAIN) / GAIN - sky
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sources = measure_sources(frame_of(image, gain=GAIN))
+    assert sources.meta["gain"] == GAIN

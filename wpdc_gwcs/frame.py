@@ -39,6 +39,8 @@ class Frame:
         ``snr``, ``roundness``, ``flags``).  Exactly one of this and ``load_image`` is given.
     gain, saturation : float, optional
         Electrons per count and saturation level in counts, from the header.
+    read_noise : float, optional
+        Of the detector, in electrons, from the header: the least that the noise of a pixel can be.
     exposure : str, optional
         What tells the exposure from others of its camera: frames with the same camera and exposure
         were taken at once by the detectors of a mosaic.  `None`: the frame is on its own.
@@ -77,6 +79,7 @@ class Frame:
     load_sources: Callable | None = None
     gain: float | None = None
     saturation: float | None = None
+    read_noise: float | None = None
     exposure: str | None = None
     camera: str | None = None
     meta: dict = field(default_factory=dict)

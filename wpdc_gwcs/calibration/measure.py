@@ -14,7 +14,7 @@ from wpdc_gwcs.detection import (
     saturation_problem,
     subtract_background,
 )
-from wpdc_gwcs.exceptions import DetectionError, WPDCWarning
+from wpdc_gwcs.exceptions import CentroidWarning, DetectionError, WPDCWarning
 from wpdc_gwcs.selection import judge_sources, left_out
 
 __all__ = ["measure_sources", "quality_of", "rules_of"]
@@ -28,12 +28,14 @@ _SMALLEST = 8
 _PASSES_OF_PAIRS = 6
 
 # Noise of the sky in electrons below which a gain cannot be that of the pixels: no detector reads
-# out so quietly, and the sky's own photons come on top.
-_MIN_ELECTRONS = 0.2
+# out so quietly, and the sky's own photons come on top.  Where the header has the read noise, it is
+# this share of that, since headers round and nominal values differ.
+_MIN_ELECTRONS, _SHARE_OF_READ_NOISE = 0.2, 0.5
 
-# Factors between a stated gain and the one that the noise in the stars shows.  Scatter below the
-# photons' is proof; more of it may also be a PSF that does not fit, but for a good one.
-_MAX_GAIN_RATIO = 2.5
+# Factors between a stated gain and the one that the noise in the stars shows.  Less scatter than
+# the photons' is proof; more of it may also be a PSF that does not fit, even if it fits well: in
+# frames of CFHT/WIRCam it is that of half the gain that the noise of their skies bears out.
+_MAX_GAIN_RATIO, _MAX_GAIN_EXCESS = 2.5, 4.0
 _GOOD_MISMATCH = 0.03
 # Stars that prove it.
 _MIN_STARS = 20
@@ -104,18 +106,18 @@ def measure_sources(frame, settings=None):
         epsf = build_epsf(background, detected, gain=gain)
         if epsf is not None:
             noise = measure_noise(background, detected, epsf)
-            if settings.gain is None and _contradicts(gain, noise):
-                _warn(
-                    frame,
-                    "gain",
-                    gain,
-                    f"the noise in its stars is that of a gain of {noise.gain:.3g}",
-                )
-                gain = noise.gain
+            wrong = settings.gain is None and _contradicts(gain, noise)
+            if gain is None or wrong:
+                measured = _measure_gain(background, detected, noise)
+                if wrong:
+                    why = f"the noise in its stars is that of a gain of {measured:.3g}"
+                    _warn(frame, "gain", gain, why)
+                gain = measured if measured > 0 else None
                 detected = detect_sources(background, gain=gain, **options)
-                epsf = build_epsf(background, detected, gain=gain)
+                if wrong:
+                    epsf = build_epsf(background, detected, gain=gain)
             detected, sources = _fit_psf(background, detected, epsf, gain, settings.threshold)
-            sources.meta.update(gain=noise.gain, mismatch=noise.mismatch)
+            sources.meta.update(gain=noise.gain if gain is None else gain, mismatch=noise.mismatch)
     sources.meta["noise"] = background.noise
     if settings.min_snr == 0:
         return sources
@@ -188,9 +190,13 @@ def _first_gain(frame, settings, background):
     if settings.gain is not None or frame.gain is None:
         return settings.gain
     electrons = frame.gain * background.noise
-    if electrons > _MIN_ELECTRONS:
+    read = frame.read_noise or 0.0
+    if electrons > max(_MIN_ELECTRONS, _SHARE_OF_READ_NOISE * read):
         return frame.gain
-    _warn(frame, "gain", frame.gain, f"the noise of its sky would be {electrons:.2g} electrons")
+    why = f"the noise of its sky would be {electrons:.2g} electrons"
+    if electrons > _MIN_ELECTRONS:
+        why += f", that of the readout alone is {read:g}"
+    _warn(frame, "gain", frame.gain, why)
     return None
 
 
@@ -198,9 +204,24 @@ def _contradicts(gain, noise):
     """Tell whether the noise in the stars rules out a stated gain."""
     if gain is None or noise.n_stars < _MIN_STARS:
         return False
-    if noise.gain > _MAX_GAIN_RATIO * gain:
+    if noise.least_gain > _MAX_GAIN_RATIO * gain:
         return True
-    return noise.gain < gain / _MAX_GAIN_RATIO and noise.mismatch < _GOOD_MISMATCH
+    return noise.gain < gain / _MAX_GAIN_EXCESS and noise.mismatch < _GOOD_MISMATCH
+
+
+def _measure_gain(background, detected, noise):
+    """Gain by the noise in one half of the stars about the PSF of the other half."""
+    snr = np.asarray(detected["snr"])
+    half = np.empty(len(snr), bool)
+    half[np.argsort(snr)] = np.arange(len(snr)) % 2 == 0
+    # All stay in the lists, as neighbors; without a signal none makes a PSF, or tells noise.
+    one, other = detected.copy(), detected.copy()
+    one["snr"][~half] = 0.0
+    other["snr"][half] = 0.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CentroidWarning)
+        epsf = build_epsf(background, one)
+    return noise.gain if epsf is None else measure_noise(background, other, epsf).gain
 
 
 def _saturation(frame, settings, background):

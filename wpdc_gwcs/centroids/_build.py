@@ -7,7 +7,9 @@ from numpy.polynomial.legendre import legvander
 from scipy.linalg import LinAlgError, solveh_banded
 from scipy.spatial import KDTree
 
-from wpdc_gwcs.centroids._fit import estimate_noise, fit_stars, star_like
+from wpdc_gwcs.centroids._fit import fit_stars, star_like
+from wpdc_gwcs.centroids._modes import blur_modes, reduced_normal
+from wpdc_gwcs.centroids._noise import bin_noise, estimate_noise
 from wpdc_gwcs.centroids._profile import (
     Profile,
     moffat_samples,
@@ -15,7 +17,14 @@ from wpdc_gwcs.centroids._profile import (
     spline_taps,
 )
 
-__all__ = ["OVERSAMPLING", "fit_moffat", "learn_profile", "select_stars", "vary_profile"]
+__all__ = [
+    "OVERSAMPLING",
+    "fit_moffat",
+    "isolated",
+    "learn_profile",
+    "select_stars",
+    "vary_profile",
+]
 
 OVERSAMPLING = 4
 
@@ -59,14 +68,7 @@ def select_stars(stars, snr, quality, fwhm, shape, *, n_max, min_snr):
         Rows, the brightest first.
     """
     x, y, flux = stars
-    candidate = quality & (snr >= min_snr) & (flux > 0)
-    pairs = KDTree(np.column_stack([x, y])).query_pairs(4 * fwhm, output_type="ndarray")
-    if len(pairs):
-        i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
-        near = np.hypot(x[i] - x[j], y[i] - y[j]) / fwhm
-        # Tolerable neighbors are the fainter the nearer they are; what they leave is clipped.
-        limit = 0.02 * np.maximum(near - 1, 0) ** 2
-        candidate[i[flux[j] > limit * flux[i]]] = False
+    candidate = quality & (snr >= min_snr) & (flux > 0) & isolated(stars, fwhm)
     rows = np.flatnonzero(candidate)
     rows = rows[np.argsort(flux[rows])[::-1]]
     if len(rows) <= n_max:
@@ -79,6 +81,33 @@ def select_stars(stars, snr, quality, fwhm, shape, *, n_max, min_snr):
     rank = np.empty(len(rows), int)
     rank[order] = np.arange(len(rows)) - first[field[order]]
     return rows[np.sort(np.argsort(rank, kind="stable")[:n_max])]
+
+
+def isolated(stars, fwhm):
+    """Mark the stars whose neighbors are too faint or too far to matter.
+
+    Parameters
+    ----------
+    stars : Stars
+        All sources.
+    fwhm : float
+        FWHM in px.
+
+    Returns
+    -------
+    (N,) bool ndarray
+        True for those that are alone.
+    """
+    x, y, flux = stars
+    alone = np.ones(len(x), bool)
+    pairs = KDTree(np.column_stack([x, y])).query_pairs(4 * fwhm, output_type="ndarray")
+    if len(pairs):
+        i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+        near = np.hypot(x[i] - x[j], y[i] - y[j]) / fwhm
+        # Tolerable neighbors are the fainter the nearer they are; what they leave is clipped.
+        limit = 0.02 * np.maximum(near - 1, 0) ** 2
+        alone[i[flux[j] > limit * flux[i]]] = False
+    return alone
 
 
 def fit_moffat(field, noise, stars, fwhm, *, half, radius):
@@ -126,7 +155,7 @@ def fit_moffat(field, noise, stars, fwhm, *, half, radius):
         slopes = [
             (profile_of(shape + d).coefficients - profile.coefficients) / d.sum() for d in steps
         ]
-        left, right = _reduced_normal(field, profile, noise, stars, slopes, radius)
+        left, right = reduced_normal(field, profile, noise, stars, slopes, radius)
         left = left.sum(axis=0)
         left[np.diag_indices(4)] *= 1.001
         change = np.linalg.lstsq(left, right.sum(axis=0), rcond=None)[0]
@@ -174,7 +203,8 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
         stars = fits.stars.take(star_like(fits.stars.flux, fits.chi2, fits.valid))
         if len(stars.x) == 0:
             break
-        noise = estimate_noise(field, profile, noise, stars, radius=radius, gain=gain)
+        bins = bin_noise(field, profile, noise, stars, radius=radius)
+        noise = estimate_noise(bins, gain)
         # A profile is never known better, and the brightest stars must not rule alone.
         noise = replace(noise, mismatch=float(np.clip(noise.mismatch, 0.003, 0.3)))
         change = _residual_coefficients(field, noise, start, stars, fwhm, finest or fwhm)
@@ -218,8 +248,8 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
     with polynomials :math:`a_k(X, Y)`.  None of these has a first moment: the meaning of the
     position stays the same all over the detector.
     """
-    modes = _blur_modes(profile.coefficients[0], fwhm * profile.oversampling)
-    left, right = _reduced_normal(field, profile, noise, stars, modes, radius)
+    modes = blur_modes(profile.coefficients[0], fwhm * profile.oversampling)
+    left, right = reduced_normal(field, profile, noise, stars, modes, radius)
     ny, nx = field.image.shape
     terms = _polynomial_terms(stars.x / nx, stars.y / ny, degree)
     k, p = len(modes), terms.shape[1]
@@ -242,61 +272,6 @@ def _polynomial_terms(x, y, degree):
     return np.stack(
         [tx[:, i] * ty[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1
     )
-
-
-def _blur_modes(coefficients, scale):
-    """Coefficients of the second derivatives and of the squared Laplacian, in units of scale."""
-
-    def along(c, axis):
-        padded = np.pad(c, [(1, 1) if a == axis else (0, 0) for a in (0, 1)])
-        low, high = (np.take(padded, np.arange(n, n + c.shape[axis]), axis) for n in (0, 2))
-        return low, high
-
-    def second(c, axis):
-        low, high = along(c, axis)
-        return (low - 2 * c + high) * scale**2
-
-    def first(c, axis):
-        low, high = along(c, axis)
-        return 0.5 * (high - low) * scale
-
-    xx, yy = second(coefficients, 1), second(coefficients, 0)
-    laplacian = xx + yy
-    return [
-        xx / 8,
-        first(first(coefficients, 0), 1) / 4,
-        yy / 8,
-        (second(laplacian, 0) + second(laplacian, 1)) / 128,
-    ]
-
-
-def _reduced_normal(field, profile, noise, stars, modes, radius):
-    """Set up normal equations (N, K, K), (N, K) for modes, free of position and flux."""
-    half = int(np.ceil(radius))
-    xc, yc, pixels, use, sky = field.cut(stars, half, radius)
-    shares = profile.shares(stars.x, stars.y)
-    basis = profile.evaluate(stars.x - xc, stars.y - yc, half, shares)
-    flux = stars.flux[:, None]
-    model = flux * basis[0]
-    residual = pixels - model
-    weight = use / noise.variance(sky, model)
-    weight *= np.minimum(1, _HUBER / np.maximum(np.abs(residual) * np.sqrt(weight), 1e-9))
-    zero, one = np.zeros(1), np.ones((len(flux), 1))
-    common = [
-        flux * shape.evaluate(stars.x - xc, stars.y - yc, half, one, gradient=False)[0]
-        for shape in (
-            Profile(mode.reshape(1, *mode.shape[-2:]), profile.oversampling, zero, zero)
-            for mode in modes
-        )
-    ]
-    own = np.stack([flux * basis[1], flux * basis[2], basis[0]], axis=1)
-    common = np.stack(common, axis=1)
-    both = np.concatenate([own, common, residual[:, None]], axis=1)
-    normal = (both[:, :-1] * weight[:, None]) @ both.transpose(0, 2, 1)
-    # Positions and fluxes are eliminated star by star.
-    solved = np.linalg.pinv(normal[:, :3, :3]) @ normal[:, :3, 3:]
-    reduced = normal[:, 3:, 3:] - normal[:, 3:, :3] @ solved
-    return reduced[:, :, :-1], reduced[:, :, -1]
 
 
 def _residual_coefficients(field, noise, profile, stars, fwhm, finest):

@@ -1,20 +1,17 @@
 """Weighted least squares for the position and flux of many stars at once."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import percentile_filter
-from scipy.optimize import least_squares
 
 from wpdc_gwcs.centroids._profile import cutouts
 
 __all__ = [
     "Field",
-    "Noise",
     "StarFits",
     "Stars",
-    "estimate_noise",
     "fit_stars",
     "render",
     "star_like",
@@ -23,41 +20,9 @@ __all__ = [
 # Stars fitted at a time: bounds the memory for their pixels.
 _CHUNK = 4000
 
-# Error of the profile below which nobody's data can tell.
-_MIN_MISMATCH = 0.002
-
 _MAX_STEP = 0.5  # px per iteration
 _MAX_ITERATIONS = 12
 _CONVERGED = 1e-4  # px
-
-
-@dataclass(frozen=True)
-class Noise:
-    r"""Variance of a pixel: background, photons, and what the profile does not describe.
-
-    Parameters
-    ----------
-    inverse_gain : float
-        Counts per electron.
-    mismatch : float
-        Error of the profile at its peak, relative to its value there.
-
-    Notes
-    -----
-    :math:`\sigma^2 = \sigma_\mathrm{sky}^2 + m / g + \epsilon^2 m m_\mathrm{peak}` with m the
-    model's counts.  The error of the profile has the form of photon noise, so that the brightest
-    stars are fitted with the same relative weights as those with photon noise alone; the same
-    relative error everywhere would shift them by whatever asymmetry the wings have.
-    """
-
-    inverse_gain: float = 0.0
-    mismatch: float = 0.02
-
-    def variance(self, sky, model):
-        """Variance for pixels of given sky and model counts."""
-        model = np.maximum(model, 0)
-        peak = model.max(axis=-1, keepdims=True)
-        return sky.variance + model * (self.inverse_gain * sky.photons + self.mismatch**2 * peak)
 
 
 class Sky(NamedTuple):
@@ -363,66 +328,3 @@ def star_like(flux, chi2, valid, *, limit=2.5, width=31):
     result = np.zeros(len(flux), bool)
     result[rows] = chi2[rows] < limit * typical
     return result
-
-
-def estimate_noise(field, profile, noise, stars, *, radius, gain=None):
-    """Learn from residuals of well measured stars how far the profile is off, and the gain.
-
-    Parameters
-    ----------
-    field, profile, noise, stars, radius
-        As for `fit_stars`; stars where the fit has converged.
-    gain : float, optional
-        Electrons per count; estimated if not given.
-
-    Returns
-    -------
-    Noise
-        Noise with the new gain and mismatch.
-    """
-    half = int(np.ceil(radius))
-    xc, yc, pixels, use, sky = field.cut(stars, half, radius)
-    shares = profile.shares(stars.x, stars.y)
-    basis = profile.evaluate(stars.x - xc, stars.y - yc, half, shares)
-    flux = stars.flux
-    model = flux[:, None] * basis[0]
-    use &= model > np.sqrt(sky.variance)
-    weight = use / noise.variance(sky, model)
-    jacobian = np.stack([flux[:, None] * b for b in basis[1:]] + [basis[0]], axis=1)
-    normal = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
-    good = use.sum(axis=1) >= 6
-    normal[~good] = np.eye(3)
-    # A fit takes part of the scatter away, most where few pixels decide: the leverage.
-    leverage = weight * np.einsum("sip,sij,sjp->sp", jacobian, np.linalg.pinv(normal), jacobian)
-    use &= good[:, None] & (leverage < 0.8)
-    if np.count_nonzero(use) < 50:
-        return replace(noise, inverse_gain=0.0 if gain is None else 1 / gain)
-    residual2 = ((pixels - model) ** 2)[use] / (1 - leverage[use])
-    square = (model * model.max(axis=1, keepdims=True))[use]
-    photons, sky = (model * sky.photons)[use], sky.variance[use]
-    order = np.argsort(square)
-    bins = np.array_split(order, int(np.clip(len(order) // 50, 1, 40)))
-    # 1.4826 MAD squared = median of the squares / 0.4549
-    measured = np.array([np.median(residual2[b]) for b in bins]) / 0.4549 + 1e-30
-    m, s, q = (np.array([np.mean(v[b]) for b in bins]) for v in (photons, sky, square))
-    known = s if gain is None else s + m / gain
-
-    def variance(logs):
-        photons = m * np.exp(logs[1]) if gain is None else 0.0
-        return known + photons + np.exp(2 * logs[0]) * q
-
-    # Ratios, not differences: a variance is uncertain in proportion to itself; and robustly, for
-    # galaxies among the stars.
-    start = [np.log(0.02)] + ([np.log(0.1 * np.median(s / m))] if gain is None else [])
-    logs = least_squares(
-        lambda logs: np.log(measured / variance(logs)),
-        start,
-        bounds=(
-            [np.log(_MIN_MISMATCH)] + [-30] * (gain is None),
-            [np.log(0.5)] + [30] * (gain is None),
-        ),
-        loss="soft_l1",
-        f_scale=0.2,
-    ).x
-    inverse_gain = np.exp(logs[1]) if gain is None else 1 / gain
-    return Noise(float(inverse_gain), float(np.exp(logs[0])))

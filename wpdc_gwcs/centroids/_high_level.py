@@ -6,26 +6,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from wpdc_gwcs.centroids._blends import judge_profiles, weigh_neighbors
 from wpdc_gwcs.centroids._build import (
     OVERSAMPLING,
     fit_moffat,
+    isolated,
     learn_profile,
     select_stars,
     vary_profile,
 )
 from wpdc_gwcs.centroids._fit import (
     Field,
-    Noise,
     StarFits,
     Stars,
-    estimate_noise,
     fit_stars,
     render,
     star_like,
 )
+from wpdc_gwcs.centroids._modes import blur_modes, mode_profiles
+from wpdc_gwcs.centroids._noise import Noise, bin_noise, estimate_noise, least_gain
 from wpdc_gwcs.centroids._profile import Profile, moffat_samples, spline_coefficients
 from wpdc_gwcs.exceptions import CentroidWarning
-from wpdc_gwcs.flags import FLAG_FIT_FAILED
+from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EXTENDED, FLAG_FIT_FAILED, FLAG_SATURATED
 from wpdc_gwcs.selection import select_sources
 from wpdc_gwcs.threads import one_blas_thread
 
@@ -36,6 +38,9 @@ log = logging.getLogger(__name__)
 # Stars whose residuals tell the error of the PSF.
 _MAX_STARS = 1000
 _MIN_STARS = 8
+_ENOUGH_ALONE = 50
+# Share of the noise in stars that must be that of their photons to tell the gain.
+_LEAST_PHOTONS = 0.1
 # Reduced chi square, absolute and relative to that of sources as bright, from which a source is
 # not a star.
 _MAX_CHI2 = 4.0
@@ -44,12 +49,20 @@ _TOLERATED_CHI2 = 1.5
 # Light of neighbors, in standard deviations of the sky, that does not matter to a fit.
 _NEGLIGIBLE = 0.05
 _CHUNK = 10_000
+# Relative error of a neighbor's light beside its core: what any PSF is known to at best, what that
+# of a saturated star is, whose flux comes from its wings, and that of a source that has no model.
+_LEAST_ERROR, _SATURATED_ERROR, _NO_MODEL = 0.02, 0.2, 1.0
+# A star is blended where its neighbors cost it more than this many times the error it would have
+# alone, and more than so many px.
+_MAX_COST, _TOLERATED_COST = 1.5, 0.01
 # Error of the PSF, relative, below which a residual is no sign of another star.
 _MODEL_ERROR = 0.1
 # Error of the PSF, relative, up to which it is as smooth as its width tells; and the FWHM in px of
 # the finest structure looked for otherwise.
 _FAIR_MISMATCH = 0.03
 _FINEST = 1.4
+# Share of broad stars that is not chance.
+_BROAD_SHARE = 0.04
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
 
@@ -144,6 +157,11 @@ def _learn(field, stars, fwhm, gain, vary):
     options = {"fwhm": fwhm, "radius": radius, "gain": gain}
     chosen = stars
     profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=4, **options)
+    broad, _ = judge_profiles(field, profile, noise, stars, stars.flux > 0, fwhm, radius)
+    if broad.mean() > _BROAD_SHARE and np.count_nonzero(~broad) >= _MIN_STARS:
+        # Hidden companions have made the profile broader.
+        chosen = stars.take(~broad)
+        profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=2, **options)
     finest = fwhm
     while noise.mismatch > _FAIR_MISMATCH and finest > 2 * _FINEST:
         # Rings and trails have edges that are finer than they are wide.
@@ -218,8 +236,11 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3, refit
         \sigma^2 = \sigma_\mathrm{sky}^2 + f \psi / g
                    + \epsilon^2 f^2 \psi \psi_\mathrm{max} .
 
-    The errors are those of the inverse of the normal matrix, times
-    :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1.
+    The errors are those of all stars fitted together: of the normal matrix with the neighbors
+    eliminated, times :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1, and what is wrong in
+    the models of the neighbors besides.  Where neighbors cost a star more than half of its error
+    and more than 0.01 px, `wpdc_gwcs.detection.FLAG_BLENDED` is set, and it is cleared elsewhere;
+    where the profile is broader than those of other stars, `wpdc_gwcs.detection.FLAG_EXTENDED`.
 
     Examples
     --------
@@ -245,13 +266,14 @@ def fit_centroids(data, sources, epsf, *, gain=None, error=None, passes=3, refit
     fwhm = _typical_fwhm(sources)
     stars = _stars_of(sources, unit)
     quality = select_sources(sources)
-    fits = _fit(field, profile, stars, quality, fwhm, _per_unit(gain, unit), passes, refit)
     flags = (
         np.array(sources["flags"], int)
         if "flags" in sources.colnames
         else np.zeros(len(stars.x), int)
     )
-    return _fitted_table(sources, fits, flags, fwhm, unit)
+    gain = _per_unit(gain, unit)
+    fits, shift, flags = _fit(field, profile, stars, quality, flags, fwhm, gain, passes, refit)
+    return _fitted_table(sources, fits, shift, flags, fwhm, unit)
 
 
 @one_blas_thread
@@ -297,7 +319,10 @@ class StarNoise:
     Parameters
     ----------
     gain : float
-        Electrons per count by which the noise grows with the stars' light.
+        Electrons per count by which the noise grows with the stars' light; NaN where errors of the
+        PSF hide it.
+    least_gain : float
+        Gain below which the photons alone would make more noise than there is, 0 if unknown.
     mismatch : float
         Error of the PSF at its peak, relative to its value there.
     n_stars : int
@@ -305,6 +330,7 @@ class StarNoise:
     """
 
     gain: float
+    least_gain: float
     mismatch: float
     n_stars: int
 
@@ -331,7 +357,8 @@ def measure_noise(data, sources, epsf, *, error=None):
 
     Notes
     -----
-    The PSF has taken some of the stars' noise into it: the gain comes out up to a third too high.
+    A PSF that was made from the same stars has taken some of their noise into it, and the gain
+    comes out up to a third too high; from one that was made from other stars it is right.
 
     Examples
     --------
@@ -341,28 +368,39 @@ def measure_noise(data, sources, epsf, *, error=None):
     fwhm = _typical_fwhm(sources)
     stars = _stars_of(sources, unit)
     quality = select_sources(sources)
-    noise, n = _noise_of(field, _from_photutils(epsf), stars, quality, fwhm, None)
-    return StarNoise(1 / max(noise.inverse_gain * unit, 1e-300), noise.mismatch, n)
+    bins, n = _noise_bins(field, _from_photutils(epsf), stars, quality, fwhm, None)
+    noise = estimate_noise(bins)
+    gain = np.nan
+    if bins is not None:
+        photons = np.median(noise.inverse_gain * bins.photons / bins.measured)
+        gain = 1 / (noise.inverse_gain * unit) if photons > _LEAST_PHOTONS else np.nan
+    return StarNoise(float(gain), least_gain(bins) / unit, noise.mismatch, n)
 
 
-def _noise_of(field, profile, stars, quality, fwhm, gain):
-    """Noise by the residuals of the brightest stars of good quality, and how many they are."""
+def _noise_bins(field, profile, stars, quality, fwhm, gain):
+    """Noise in the brightest stars of good quality, and how many they are."""
     radius = _fit_radius(fwhm)
-    noise = Noise(0.0 if gain is None else 1 / gain, 0.02)
-    candidates = np.flatnonzero(quality & (stars.flux > 0))
+    noise = Noise(0.0 if gain is None else 1 / gain)
+    good = quality & (stars.flux > 0)
+    # Neighbors' light is no noise, if enough stars have none.
+    alone = good & isolated(stars, fwhm)
+    candidates = np.flatnonzero(alone if alone.sum() >= _ENOUGH_ALONE else good)
     candidates = candidates[np.argsort(stars.flux[candidates])[::-1][:_MAX_STARS]]
     fits = fit_stars(field, profile, noise, stars.take(candidates), radius=radius)
     clean = star_like(fits.stars.flux, fits.chi2, fits.valid)
-    noise = estimate_noise(field, profile, noise, fits.stars.take(clean), radius=radius, gain=gain)
-    log.info("noise of the fits: %s", noise)
-    return noise, int(clean.sum())
+    # A star that is a little broader or sharper than others has no worse position.
+    blur = blur_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)
+    modes = mode_profiles(blur[:3], profile.oversampling)
+    bins = bin_noise(field, profile, noise, fits.stars.take(clean), radius=radius, modes=modes)
+    return bins, int(clean.sum())
 
 
 @one_blas_thread
-def _fit(field, profile, stars, quality, fwhm, gain, passes, refit):
-    """Fits of all stars; those of good quality tell the noise."""
+def _fit(field, profile, stars, quality, flags, fwhm, gain, passes, refit):
+    """Fits of all stars, errors by neighbors, flags; those of good quality tell the noise."""
     radius = _fit_radius(fwhm)
-    noise, _ = _noise_of(field, profile, stars, quality, fwhm, gain)
+    noise = estimate_noise(_noise_bins(field, profile, stars, quality, fwhm, gain)[0], gain)
+    log.info("noise of the fits: %s", noise)
     if refit:
         fits = StarFits.unfitted(stars)
     else:
@@ -376,7 +414,32 @@ def _fit(field, profile, stars, quality, fwhm, gain, passes, refit):
         work = replace(field, image=np.subtract(field.image, model, out=model))
         again = fit_stars(work, profile, noise, own.take(rows), radius=radius, own=own.take(rows))
         fits = fits.updated(rows, again)
-    return fits
+    return _judge_neighbors(field, profile, noise, fits, stars, flags, fwhm)
+
+
+def _judge_neighbors(field, profile, noise, fits, start, flags, fwhm):
+    """Fits with the covariance of all stars together, errors by neighbors, flags of blends."""
+    radius = _fit_radius(fwhm)
+    model, own = _model_of(field, profile, fits, start, fwhm)
+    residual = replace(field, image=np.subtract(field.image, model, out=model))
+    fitted = own.flux > 0
+    clean = (flags == 0) & star_like(own.flux, fits.chi2, fitted, limit=_MAX_CHI2)
+    broad, excess = judge_profiles(
+        residual, profile, noise, own, clean, fwhm, radius, subtracted=True
+    )
+    unsure = np.where(flags & FLAG_SATURATED, _SATURATED_ERROR, max(_LEAST_ERROR, noise.mismatch))
+    all_light = own._replace(flux=np.where(fitted, own.flux, np.maximum(start.flux, 0)))
+    alone = np.where(fitted[:, None, None], fits.covariance, np.nan)
+    joint, shift = weigh_neighbors(
+        field, profile, noise, all_light, alone, radius, np.where(fitted, unsure, _NO_MODEL)
+    )
+    before, after = (np.sqrt(c[:, 0, 0] + c[:, 1, 1]) for c in (alone, joint))
+    error = np.hypot(after, shift)
+    blended = ~(error < np.maximum(_MAX_COST * before, _TOLERATED_COST)) & fitted
+    flags = np.where(fitted, flags & ~FLAG_BLENDED, flags)
+    flags |= np.where(blended, FLAG_BLENDED, 0) | np.where(broad, FLAG_EXTENDED, 0)
+    joint = np.where(np.isfinite(joint), joint, alone)
+    return replace(fits, covariance=joint, chi2=fits.chi2 - excess), shift, flags
 
 
 def _model_of(field, profile, fits, stars, fwhm):
@@ -412,7 +475,7 @@ def _near(stars, start, fwhm):
     return np.hypot(stars.x - start.x, stars.y - start.y) < max(0.5 * fwhm, 1.0)
 
 
-def _fitted_table(sources, fits, flags, fwhm, unit):
+def _fitted_table(sources, fits, shift, flags, fwhm, unit):
     """Copy of the sources with the results of the fits, in counts."""
     result = sources.copy()
     good = fits.valid & _near(fits.stars, _stars_of(sources, unit), fwhm)
@@ -421,6 +484,7 @@ def _fitted_table(sources, fits, flags, fwhm, unit):
         snr = fits.stars.flux / error[:, 2]
         # Beyond chance, a high chi square is an unseen neighbor or a PSF that does not fit.
         error *= np.sqrt(np.maximum(fits.chi2 / _TOLERATED_CHI2, 1))[:, None]
+    error[:, :2] = np.hypot(error[:, :2], shift[:, None] / np.sqrt(2))
     columns = {
         "x": fits.stars.x,
         "y": fits.stars.y,

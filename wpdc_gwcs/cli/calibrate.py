@@ -227,7 +227,7 @@ def calibrate_command(
     from wpdc_gwcs.calibration import Settings, calibrate
     from wpdc_gwcs.calibration.cluster import cluster_executor
     from wpdc_gwcs.calibration.results import ERRORS
-    from wpdc_gwcs.io import read_frames
+    from wpdc_gwcs.io import read_files
 
     if report:
         require_plotting("--report")
@@ -267,7 +267,7 @@ def calibrate_command(
     keys = {"exposure_keyword": exposure_key, "camera": not no_camera}
     keys |= by_hand(epoch, pixel_scale, origin)
     keys |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
-    loaded = [f for path in frames for f in read_frames(path, wcs=wcs, detector=detector, **keys)]
+    loaded = read_files(frames, wcs=wcs, detector=detector, **keys)
     page = output / "report.html"
     if report:
         require_free(page, overwrite or resume)

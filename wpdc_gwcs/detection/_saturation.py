@@ -7,6 +7,8 @@ __all__ = ["plateau", "saturation_problem"]
 # A level stated for saturation belongs to other pixels if the brightest exceed it so many times:
 # flat fields and stacks make less of it.
 _MAX_EXCESS = 3.0
+# Pixels that are cut off at less than this share of it are saturated there.
+_BELOW = 0.95
 # Levels within so many standard deviations of the background are those of the sky.
 _ABOVE_SKY = 10.0
 
@@ -32,6 +34,9 @@ def saturation_problem(background, saturation):
     highest = float(background.image.max()) * background.unit
     if highest > _MAX_EXCESS * height:
         return f"pixels of the image reach {highest + background.level:.4g}"
+    top = plateau(background)
+    if top is not None and top - background.level < _BELOW * height:
+        return f"pixels of the image are cut off at {top:.4g}"
     return None
 
 

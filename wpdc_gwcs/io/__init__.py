@@ -7,6 +7,7 @@
                                                   Calibration <--read--
 """
 
+from wpdc_gwcs.io.beside import read_files
 from wpdc_gwcs.io.files import OutputExistsError, atomic_path
 from wpdc_gwcs.io.formats import FORMATS, read, read_wcs, write
 from wpdc_gwcs.io.frames import read_frames
@@ -17,6 +18,7 @@ __all__ = [
     "OutputExistsError",
     "atomic_path",
     "read",
+    "read_files",
     "read_frames",
     "read_matches",
     "read_table",

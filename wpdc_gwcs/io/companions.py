@@ -9,22 +9,26 @@
 import logging
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from wpdc_gwcs.exceptions import FrameError, WPDCWarning
-from wpdc_gwcs.io.files import open_fits, split_extension
+from wpdc_gwcs.io.files import READ_ERRORS, first_line, open_fits, split_extension, stem_of
 from wpdc_gwcs.io.headers import find_extension, header_text
 from wpdc_gwcs.io.images import pixels_of
 from wpdc_gwcs.robust import robust_scatter
 
 __all__ = [
+    "SCIENCE_WORDS",
+    "WCS_KEYS",
     "Companion",
     "data_section",
     "given_plane",
     "load_mask",
     "load_weight",
+    "map_beside",
+    "map_role",
     "pair_companions",
 ]
 
@@ -32,24 +36,30 @@ log = logging.getLogger(__name__)
 
 # Words of extension names, by what the pixels say; the first family that has one wins.
 _ROLES = {
-    "mask": "DQ DQM DQF MASK MSK BPM BAD BADPIX FLAG FLAGS FLG QUALITY QUAL DEFECTS",
-    "weight": "WHT WGT WEIGHT WEIGHTS WMAP IVAR INVVAR INVERSE INV",
+    "mask": "GOODPIX DQ DQM DQF MASK MSK BPM BAD BADPIX FLAG FLAGS FLG QUALITY QUAL DEFECTS OOD",
+    "weight": "CONF CONFIDENCE CONFMAP WHT WGT WEIGHT WEIGHTS WMAP IVAR INVVAR INVERSE INV OOW",
     "error": "ERR ERROR ERRORS RMS SIGMA SIG NOISE UNC UNCERT UNCERTAINTY STD STDDEV STDEV",
     "variance": "VAR VARIANCE",
     "other": "SAMP TIME EXP EXPTIME EXPMAP EXPOSURE COV COVERAGE CON CTX CONTEXT NCOMBINE NCOMB "
-    "BKG BKGD BACKGROUND SKY MODEL RESIDUAL RESID AREA PSF OOD IMARR WCSDVARR DVARR",
+    "BKG BKGD BACKGROUND SKY MODEL RESIDUAL RESID AREA PSF IMARR WCSDVARR DVARR",
 }
 _ROLES = {role: frozenset(words.split()) for role, words in _ROLES.items()}
+# Files are told by the same words, but for those that say other things of exposures as well.
+_MAP_WORDS = {
+    role: names - {"STD", "SIG", "BAD"} for role, names in _ROLES.items() if role != "other"
+}
 # Longer words count within others too (BADPIXELMASK, WEIGHTMAP).
 _LONGEST_PLAIN = 3
-_SCIENCE = frozenset(("SCI", "SCIENCE", "IMAGE", "IMG", "DATA", "PRIMARY", "COMPRESSED"))
+SCIENCE_WORDS = frozenset(
+    ("SCI", "SCIENCE", "IMAGE", "IMG", "DATA", "PRIMARY", "COMPRESSED", "OOI")
+)
 # The standard of HDUCLASS says it in so many words.
 _CLASSES = {"ERROR": "error", "QUALITY": "mask", "WEIGHT": "weight"}
 _CLASS_VALUES = {"MSE": "variance", "RMSE": "error", "INVMSE": "weight", "INVRMSE": "other"}
 
 # Keywords that two extensions of one detector share, and two detectors do not.
 _IDENTITY = ("CCDNAME", "CHIPNAME", "DETNAME", "DETECTOR", "CHIPID", "CCDNUM", "CCDCHIP", "DETSEC")
-_WCS_KEYS = ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2", "CD1_1", "CD1_2", "PC1_1", "CDELT1")
+WCS_KEYS = ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2", "CD1_1", "CD1_2", "PC1_1", "CDELT1")
 
 # Planes of a mask by name (Rubin and its relatives, MP_name) that make a pixel useless; the others
 # say where sources are, or what was done with them.
@@ -147,21 +157,45 @@ def _role_of(hdu):
         text = header_text(hdu.header, key).upper()
         if text in _CLASS_VALUES or text in _CLASSES:
             return _CLASS_VALUES.get(text) or _CLASSES[text]
-    for role, names in _ROLES.items():
-        for word in _words(hdu):
-            longer = [n for n in names if len(n) > _LONGEST_PLAIN and role != "other"]
-            if word in names or any(n in word for n in longer):
-                return role
+    return _role_by(_words(hdu), _ROLES)
+
+
+def _role_by(words, roles):
+    for role, names in roles.items():
+        longer = [n for n in names if len(n) > _LONGEST_PLAIN and role != "other"]
+        if any(word in names or any(n in word for n in longer) for word in words):
+            return role
     return None
+
+
+def map_role(words):
+    """Tell what the pixels of a file are by words of its name.
+
+    Parameters
+    ----------
+    words : sequence of str
+        In capitals, in order.
+
+    Returns
+    -------
+    {"mask", "weight", "error", "variance"} or None
+        `None` where they do not say.
+    """
+    # Together as well: bad_pixel_map.
+    return _role_by([*words, "".join(words)], _MAP_WORDS)
 
 
 def _kinship(frame, other):
     """Rank of how surely two extensions belong together."""
     rest = [
-        [w for w in _words(h) if w not in _SCIENCE and not any(w in n for n in _ROLES.values())]
+        [
+            w
+            for w in _words(h)
+            if w not in SCIENCE_WORDS and not any(w in n for n in _ROLES.values())
+        ]
         for h in (frame, other)
     ]
-    return rest[0] == rest[1], frame.ver == other.ver, _same(frame, other, _WCS_KEYS)
+    return rest[0] == rest[1], frame.ver == other.ver, _same(frame, other, WCS_KEYS)
 
 
 def _same(one, other, keys):
@@ -172,7 +206,7 @@ def _is_twin(frame, other):
     """Whether an extension has the WCS of a frame, and nothing says that it is another detector."""
     if _shape(frame) != _shape(other) or "CRVAL1" not in other.header:
         return False
-    if not (_same(frame, other, _WCS_KEYS) and _same(frame, other, _IDENTITY)):
+    if not (_same(frame, other, WCS_KEYS) and _same(frame, other, _IDENTITY)):
         return False
     # Numbers apart, detectors of one camera have one name.
     kind = [[w for w in _words(h) if not w.isdigit()] for h in (frame, other)]
@@ -238,6 +272,31 @@ def given_plane(path, frame_index, frame_name, shape, role):
     if role == "weight" and own in ("error", "variance"):
         role = own
     return Companion(str(plain), index, role, given=True)
+
+
+def map_beside(path, frame_index, frame_name, shape):
+    """Find the mask or the weight that a file beside that of a frame has for it.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    frame_index : int
+        Extension of the frame.
+    frame_name : str
+        Its name.
+    shape : (int, int)
+        Shape of the frame.
+
+    Returns
+    -------
+    Companion
+        Where it is, and what, by the name of the file.
+    """
+    words = re.findall(r"[A-Z]+|\d+", stem_of(path).upper())
+    role = map_role(words)
+    found = given_plane(path, frame_index, frame_name, shape, role)
+    return replace(found, role=role, given=False)
 
 
 def data_section(header, shape):

@@ -25,6 +25,7 @@ from wpdc_gwcs.io.companions import (
     given_plane,
     load_mask,
     load_weight,
+    map_beside,
     pair_companions,
 )
 from wpdc_gwcs.io.dates import EXPOSURE_KEYS, header_epoch, header_start
@@ -49,6 +50,7 @@ from wpdc_gwcs.io.headers import (
 from wpdc_gwcs.io.images import (
     choose_plane,
     image_gain,
+    image_read_noise,
     image_saturation,
     image_shape,
     load_image,
@@ -100,6 +102,7 @@ def read_frames(
     mask=None,
     weight_map=None,
     mask_bits=None,
+    beside=(),
 ):
     """Read the frames of a file.
 
@@ -137,6 +140,9 @@ def read_frames(
     mask_bits : int, optional
         Sum of the bits of masks that are bad.  By default those that the header names, or all but
         those whose pixels are like the rest, or that mark sources.
+    beside : sequence of path-like, optional
+        Files with masks and weights that came with this one: they are used as those in the file
+        itself, where ``mask`` and ``weight_map`` give none.
 
     Returns
     -------
@@ -224,7 +230,7 @@ def read_frames(
             warnings.warn(message)
         if part["kind"] != "image":
             _refuse_planes(part["where"], planes)
-        part["companions"] = _companions(part, companions, planes)
+        part["companions"] = _companions(part, companions, planes, beside)
         part["mask_bits"] = mask_bits
         label = "_".join([part["label"]] * several + part["chosen"])
         frames.append(_frame_of(part, path, stem, label, detector, image_shape, exposure_keyword))
@@ -296,9 +302,11 @@ def _refuse_planes(where, given):
             raise FrameError(f"{where}: is a source list, which has no use for {path}")
 
 
-def _companions(part, companions, given):
-    """Gather what goes with a frame: the planes given, else those of its own file."""
+def _companions(part, companions, given, beside):
+    """Gather what goes with a frame: the planes given, else those of its own file and beside."""
     found = list(companions.get(part["index"], ()))
+    if part["kind"] == "image":
+        found += [map_beside(p, part["index"], part["label"], part["shape"]) for p in beside]
     for role, path in given.items():
         if path is None:
             continue
@@ -411,21 +419,23 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
         epoch=header_epoch(headers, name=where),
         source=where,
         gain=image_gain(headers),
+        read_noise=image_read_noise(headers),
         saturation=image_saturation(headers),
         **_keys_of(headers, exposure_keyword, where, part["chosen"]),
-        meta=_facts(headers) | _choices(part),
-        inputs=tuple(c.path for c in part["companions"] if c.given),
+        meta=_facts(headers) | _choices(part, str(path)),
+        inputs=tuple(dict.fromkeys(c.path for c in part["companions"] if c.path != str(path))),
         **loaders,
     )
 
 
-def _choices(part):
+def _choices(part, path):
     """State what of the file the frame is made of, where there was a choice."""
     if part["kind"] == "table":
         return _first_pixel(part["origin"])
     if part["kind"] == "list":
         return {}
-    facts = {c.role: f"{c.path}[{c.index}]" for c in part["companions"] if c.given}
+    outside = [c for c in part["companions"] if c.given or c.path != path]
+    facts = {c.role: f"{c.path}[{c.index}]" for c in outside}
     if part["mask_bits"] is not None:
         facts["mask_bits"] = part["mask_bits"]
     return facts | ({"plane": part["plane"]} if part["plane"] != 0 else {})

@@ -21,6 +21,7 @@ __all__ = [
     "LUMINANCE",
     "choose_plane",
     "image_gain",
+    "image_read_noise",
     "image_saturation",
     "image_shape",
     "load_image",
@@ -33,6 +34,17 @@ __all__ = [
 LUMINANCE = "L"
 
 _GAIN_KEYS = ("GAIN", "EGAIN", "GAINA", "CCDGAIN", "ATODGAIN", "HIERARCH ESO DET OUT1 CONAD")
+_READ_NOISE_KEYS = (
+    "RDNOISE",
+    "READNOIS",
+    "READNOISE",
+    "RON",
+    "ENOISE",
+    "RDNOISEA",
+    "READNSEA",
+    "RONOISE",
+    "HIERARCH ESO DET OUT1 RON",
+)
 _SATURATION_KEYS = ("SATURATE", "SATURATION", "SATURAT", "SATLEVEL", "SATURATA")
 
 # Spellings of units that count electrons or digital units, and of a rate.
@@ -197,6 +209,22 @@ def _is_physical(text):
     except ValueError:
         return False
     return unit != u.dimensionless_unscaled
+
+
+def image_read_noise(headers):
+    """Read the noise of the readout.
+
+    Parameters
+    ----------
+    headers : sequence of `~astropy.io.fits.Header`
+        Of the extension and of the file.
+
+    Returns
+    -------
+    float or None
+        In electrons; `None` where the header does not tell.
+    """
+    return positive_number(headers, _READ_NOISE_KEYS)
 
 
 def image_saturation(headers):

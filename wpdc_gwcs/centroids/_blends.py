@@ -1,0 +1,220 @@
+"""What other stars do to a fit: those beside it, and those that hide under it."""
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from wpdc_gwcs.centroids._modes import blur_modes, reduced_normal
+
+__all__ = ["judge_profiles", "weigh_neighbors"]
+
+# Neighbors that share pixels with a fit are at most this far, in radii of the fits.
+_REACH = 1.8
+# Pairs at a time: bounds the memory for their pixels.
+_CHUNK = 20_000
+
+# Significance in sigma of the broadening along the direction where it is greatest, which one star
+# in a hundred exceeds by noise, of any profile.  Where the width is known better than the next
+# number, it is that times the fourth root of how much better: companions of a bright star show far
+# beyond, and bright stars are few.  Where it is known worse than the last one, none show.
+_MAX_BROADENING, _KNOWN, _UNKNOWN = 3.0, 0.025, 0.055
+# Directions tried.
+_N_DIRECTIONS = 12
+# Stars nearest in place, and the best measured of all, that tell how profiles differ.
+_NEAREST, _BEST = 25, 300
+_LEAST = 20
+# Variance of a median over that of a mean.
+_MEDIAN_COST = 1.57
+# Outliers, in median absolute widths; and so few that both sides are needed.
+_OUTLIER, _FEW = 6.0, 60
+
+
+def weigh_neighbors(field, profile, noise, stars, covariance, radius, unsure):
+    r"""Find what neighbors cost the positions of stars that were fitted in turn with them.
+
+    Parameters
+    ----------
+    field, profile, noise, radius
+        As for `fit_stars`.
+    stars : Stars
+        All stars as fitted; those without a fit with the flux they may have.
+    covariance : (N, 3, 3) ndarray
+        Of every star's fit alone; NaN where there is none.
+    unsure : (N,) ndarray
+        Relative error of every star's light in the pixels of its neighbors.
+
+    Returns
+    -------
+    joint : (N, 3, 3) ndarray
+        Covariance of the fit of all together; NaN where it cannot tell a star from its neighbors.
+    shift : (N,) ndarray
+        Error of the position in px by what is wrong in the models of the neighbors.
+
+    Notes
+    -----
+    With :math:`N_{ij}` the weighted products of the derivatives of stars i and j over the pixels of
+    i, the covariance is that of the star with its neighbors eliminated,
+
+    .. math::
+        C_i = \Big(N_{ii} - \sum_j N_{ij} N_{jj}^{-1} N_{ji}\Big)^{-1},
+
+    and all of the light of neighbor j would shift it by
+    :math:`(N_{ii}^{-1} N_{ij})_{xf} f_j`.
+    """
+    joint, shift = covariance.copy(), np.zeros(len(stars.x))
+    pairs = KDTree(np.column_stack([stars.x, stars.y])).query_pairs(
+        _REACH * radius, output_type="ndarray"
+    )
+    fitted = np.isfinite(covariance).all(axis=(1, 2))
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    if len(pairs) == 0:
+        return joint, shift
+    i, j = pairs.T
+    cross = np.concatenate(
+        [
+            _products(field, profile, noise, stars.take(i[k]), stars.take(j[k]), radius)
+            for k in (slice(n, n + _CHUNK) for n in range(0, len(i), _CHUNK))
+        ]
+    )
+    back = np.roll(np.arange(len(i)), len(i) // 2)
+    known = fitted[i]
+    moved = covariance[i[known]] @ cross[known][:, :, 2:]
+    moved = np.hypot(moved[:, 0, 0], moved[:, 1, 0]) * stars.flux[j[known]]
+    np.add.at(shift, i[known], (unsure[j[known]] * moved) ** 2)
+    both = fitted[i] & fitted[j]
+    taken = cross[both] @ covariance[j[both]] @ cross[back[both]]
+    loss = np.zeros_like(covariance)
+    np.add.at(loss, i[both], taken)
+    rows = np.unique(i[both])
+    normal = np.linalg.inv(covariance[rows]) - 0.5 * (loss[rows] + loss[rows].transpose(0, 2, 1))
+    joint[rows] = _inverse(normal)
+    return joint, np.sqrt(shift)
+
+
+def _products(field, profile, noise, stars, others, radius):
+    """Weighted products (n, 3, 3) of the derivatives of stars and others, in the stars' pixels."""
+    half = int(np.ceil(radius))
+    xc, yc, _, use, sky = field.cut(stars, half, radius)
+    sides = []
+    for side in (stars, others):
+        shares = profile.shares(side.x, side.y)
+        value, by_x, by_y = profile.evaluate(side.x - xc, side.y - yc, half, shares)
+        flux = side.flux[:, None]
+        sides.append(np.stack([flux * by_x, flux * by_y, value], axis=1))
+    model = stars.flux[:, None] * sides[0][:, 2]
+    weight = use / noise.variance(sky, model)
+    return (sides[0] * weight[:, None]) @ sides[1].transpose(0, 2, 1)
+
+
+def _inverse(normal):
+    """Inverses of symmetric matrices, NaN where they are not positive definite."""
+    scale = np.sqrt(np.abs(np.einsum("sii->si", normal)))
+    scale = np.where(scale > 0, scale, 1.0)
+    scaled = normal / scale[:, :, None] / scale[:, None, :]
+    good = np.linalg.eigvalsh(scaled)[:, 0] > 1e-3
+    scaled[~good] = np.eye(3)
+    inverse = np.linalg.inv(scaled) / scale[:, :, None] / scale[:, None, :]
+    inverse[~good] = np.nan
+    return inverse
+
+
+def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtracted=False):
+    r"""Compare the profiles of stars with that of the frame: broader than their like, or as they.
+
+    Parameters
+    ----------
+    field, profile, noise, radius
+        As for `fit_stars`.
+    stars : Stars
+        The stars as fitted; those without a fit have no flux.
+    clean : (N,) ndarray of bool
+        True for those that may tell what stars have in common.
+    fwhm : float
+        FWHM in px.
+    subtracted : bool, optional
+        Whether the models of all stars have been taken off the image.
+
+    Returns
+    -------
+    broad : (N,) ndarray of bool
+        True for the stars that two stars describe better than one.
+    excess : (N,) ndarray
+        Reduced chi square that comes from how the profiles of the frame's stars differ.
+
+    Notes
+    -----
+    A companion nearer than the PSF is wide, of a share q of the light at :math:`(u, v)`, changes
+    the image to leading order by :math:`\tfrac12 q (1 - q) (u^2 \psi_{uu} + 2 u v \psi_{uv} + v^2
+    \psi_{vv})`; position and flux take up the orders before.  These three amplitudes are fitted,
+    what the nearest bright stars have in common is taken off, and the direction in which the
+    broadening is most significant decides.  How profiles differ from star to star (by color, or
+    because the PSF does not follow) shows in those that are narrower, which no companion makes.
+    """
+    broad, excess = np.zeros(len(stars.x), bool), np.zeros(len(stars.x))
+    rows = np.flatnonzero(stars.flux > 0)
+    clean = np.flatnonzero(clean[rows])
+    if len(clean) < _LEAST:
+        return broad, excess
+    stars = stars.take(rows)
+    modes = blur_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)[:3]
+    options = {"radius": radius, "subtracted": subtracted}
+    parts = [
+        _normal(field, profile, noise, stars.take(slice(n, n + _CHUNK)), modes, **options)
+        for n in range(0, len(rows), _CHUNK)
+    ]
+    left, right, freedom = (np.concatenate(column) for column in zip(*parts, strict=True))
+    covariance = np.linalg.pinv(left)
+    amplitude = np.einsum("sij,sj->si", covariance, right)
+    before = np.einsum("si,sij,sj->s", amplitude, left, amplitude)
+    best = clean[np.argsort(covariance[clean].trace(axis1=1, axis2=2))]
+    best = best[: int(np.clip(len(best) // 4, _LEAST, _BEST))]
+    common, unsure = _common(stars, amplitude, covariance, best)
+    amplitude -= common
+    differences = _differences(amplitude[best], covariance[best])
+    weight = np.linalg.pinv(covariance + unsure + (1 + _MEDIAN_COST / _NEAREST) * differences)
+    after = np.einsum("si,sij,sj->s", amplitude, weight, amplitude)
+    excess[rows] = (before - after) / freedom
+    angle = np.pi * np.arange(_N_DIRECTIONS) / _N_DIRECTIONS
+    along = np.stack([np.cos(angle) ** 2, np.cos(angle) * np.sin(angle), np.sin(angle) ** 2])
+    pushed = weight @ along
+    significance = np.einsum("si,sid->sd", amplitude, pushed) / np.sqrt(
+        np.maximum(np.einsum("id,sid->sd", along, pushed), 1e-300)
+    )
+    width = np.sqrt(0.5 * (covariance[:, 0, 0] + covariance[:, 2, 2]))
+    limit = _MAX_BROADENING * np.maximum(_KNOWN / np.maximum(width, 1e-9), 1) ** 0.25
+    broad[rows] = (significance.max(axis=1) > limit) & (width < _UNKNOWN)
+    return broad, excess
+
+
+def _normal(field, profile, noise, stars, modes, *, radius, subtracted):
+    """Set up the normal equations of the modes; also the freedom of the fits without them."""
+    half = int(np.ceil(radius))
+    use = field.cut(stars, half, radius)[3]
+    left, right = reduced_normal(
+        field, profile, noise, stars, modes, radius, subtracted=subtracted, robust=False
+    )
+    return left, right, np.maximum(use.sum(axis=1) - 3, 1)
+
+
+def _common(stars, amplitude, covariance, best):
+    """Median amplitudes of the nearest of the best measured stars, and their covariance."""
+    tree = KDTree(np.column_stack([stars.x[best], stars.y[best]]))
+    k = min(_NEAREST, len(best))
+    near = best[tree.query(np.column_stack([stars.x, stars.y]), k=k)[1]]
+    noise = _MEDIAN_COST / k * covariance[near].mean(axis=1)
+    return np.median(amplitude[near], axis=1), noise
+
+
+def _differences(amplitude, covariance):
+    """Covariance (3, 3) of how profiles differ from star to star.
+
+    By color, brightness or a place that the PSF does not follow.  Those stars tell that are
+    narrower than usual, which no companion makes; of few stars all do, since the brightest of them
+    make the PSF.
+    """
+    width = amplitude[:, 0] + amplitude[:, 2]
+    told = np.abs(width) < _OUTLIER * np.median(np.abs(width))
+    if len(width) > _FEW:
+        told &= width <= 0
+    seen = np.einsum("si,sj->ij", amplitude[told], amplitude[told]) / max(told.sum(), 1)
+    sizes, axes = np.linalg.eigh(seen - covariance[told].mean(axis=0))
+    return (axes * np.maximum(sizes, 0)) @ axes.T

@@ -1,0 +1,142 @@
+"""Files of one list: frames, and the masks and weights of frames that came with them.
+
+::
+
+    x.fits x.weight.fits x_mask.fits y.fits --tell_frames--> x.fits (weight, mask), y.fits
+"""
+
+import logging
+import re
+
+from wpdc_gwcs.exceptions import FrameError
+from wpdc_gwcs.io.companions import SCIENCE_WORDS, WCS_KEYS, map_role
+from wpdc_gwcs.io.files import file_kind, open_fits, split_extension, stem_of
+from wpdc_gwcs.io.frames import read_frames
+from wpdc_gwcs.io.headers import header_text
+from wpdc_gwcs.io.images import image_shape
+
+__all__ = ["read_files", "tell_frames"]
+
+log = logging.getLogger(__name__)
+
+# Words of a name that may say together what a file is: bad_pixel_mask.
+_MOST_WORDS = 3
+# What two exposures do not share.
+_TIMES = ("DATE-OBS", "MJD-OBS", "EXPNUM", "OBSID", "DATE-BEG", "TIME-OBS", "UTSTART")
+
+
+def read_files(paths, **options):
+    """Read the frames of several files, of which some may be masks and weights of others.
+
+    Parameters
+    ----------
+    paths : iterable of path-like
+        As for `wpdc_gwcs.io.read_frames`.
+    **options
+        As for `wpdc_gwcs.io.read_frames`; a mask or a weight map that is given is used instead.
+
+    Returns
+    -------
+    list of `~wpdc_gwcs.frame.Frame`
+        In the order of the files.
+
+    Raises
+    ------
+    FrameError
+        As `wpdc_gwcs.io.read_frames` does.
+    """
+    frames = []
+    for path, maps in tell_frames(paths):
+        frames += read_frames(path, beside=maps, **options)
+    return frames
+
+
+def tell_frames(paths):
+    """Tell the files that are frames from those that are masks and weights of others.
+
+    Parameters
+    ----------
+    paths : iterable of path-like
+        Files.
+
+    Returns
+    -------
+    list of (path, list)
+        Each frame's file with the files of its masks and weights.
+
+    Notes
+    -----
+    A file goes with another one if its name has a word more that says so (``x.weight.fits``,
+    ``x_bad_pixel_mask.fits``), or such a word in place of one for images (``x_image.fits``,
+    ``x_invvar.fits``), if its images are of the same shapes, and neither WCS nor time speak against
+    it.  One whose frame is not there is a frame itself, for all that anyone can tell.
+    """
+    paths = list(paths)
+    names = {}
+    for path in paths:
+        if split_extension(path)[1] is None:
+            names.setdefault(tuple(_words(path)), path)
+    maps, owners = {}, {}
+    for path in paths:
+        if split_extension(path)[1] is not None:
+            continue
+        owner = next((o for o in _owners(path, names) if _belong(o, path)), None)
+        if owner is not None and str(owner) not in owners:
+            maps.setdefault(str(owner), []).append(path)
+            owners[str(path)] = owner
+            log.info("%s: goes with %s, and is no frame", path, owner)
+    return [(path, maps.get(str(path), [])) for path in paths if str(path) not in owners]
+
+
+def _words(path):
+    return re.findall(r"[A-Z]+|\d+", stem_of(path).upper())
+
+
+def _owners(path, names):
+    """Files of the list whose names lack what this one's says of masks and weights."""
+    words = _words(path)
+    for first in range(len(words)):
+        for last in range(first + 1, min(first + _MOST_WORDS, len(words)) + 1):
+            if map_role(words[first:last]) is None:
+                continue
+            for science in ((), *((word,) for word in sorted(SCIENCE_WORDS))):
+                owner = names.get((*words[:first], *science, *words[last:]))
+                if owner is not None and str(owner) != str(path):
+                    yield owner
+
+
+def _belong(owner, path):
+    """Whether the images of a file can be those of a mask or a weight of another file."""
+    try:
+        if {file_kind(p, error=FrameError) for p in (owner, path)} != {"fits"}:
+            return False
+        sides = [_images(p) for p in (owner, path)]
+    except FrameError:
+        # What is wrong with it is said when it is read.
+        return False
+    if not all(sides) or len(sides[0]) != len(sides[1]):
+        return False
+    for one, other in zip(*sides, strict=True):
+        if image_shape(one) != image_shape(other):
+            return False
+        if "CRVAL1" in other and any(one.get(k) != other.get(k) for k in WCS_KEYS):
+            return False
+        for key in _TIMES:
+            texts = {header_text(h, key) for h in (one, other)} - {""}
+            if len(texts) > 1:
+                return False
+    return True
+
+
+def _images(path):
+    """Headers of the images of a file, with what its first one says."""
+    with open_fits(path, error=FrameError) as hdus:
+        result = []
+        for hdu in hdus:
+            if hdu.is_image and image_shape(hdu.header) is not None:
+                header = hdu.header.copy()
+                for key in _TIMES:
+                    if key not in header and key in hdus[0].header:
+                        header[key] = hdus[0].header[key]
+                result.append(header)
+        return result
