@@ -359,34 +359,41 @@ def sky_map(wcs, *, image_shape=None, out=None):
         if array.shape != (ny, nx):
             raise ValueError(f"out must hold two arrays of the shape {(ny, nx)}, not {array.shape}")
     transform = wcs.forward_transform
-    columns = np.arange(nx, dtype=float)
-    # Threads take bands of rows, in pieces that stay in the cache.
+    columns, rows = np.arange(nx, dtype=float), np.arange(ny, dtype=float)
+    if isinstance(transform, DetectorToSky):
+        function = transform.row_function(columns, rows)
+    else:
+        function = _any_rows(transform, columns, rows)
+    # Threads take bands of rows.
     band = max(1, _BAND_SIZE // nx)
-    step = max(1, _PIECE_SIZE // nx)
 
     def fill(first, last):
-        if isinstance(transform, DetectorToSky):
-            function = transform.row_function(columns)
-        else:
-            function = _any_rows(transform, columns)
-        with np.errstate(all="ignore"):
-            for start in range(first * band, min(last * band, ny), step):
-                stop = min(start + step, last * band, ny)
-                values = function(np.arange(start, stop, dtype=float))
+        for start in range(first * band, min(last * band, ny), band):
+            stop = min(start + band, ny)
+            targets = ra[start:stop], dec[start:stop]
+            if all(t.flags.c_contiguous and t.dtype == np.float64 for t in targets):
+                function(start, stop, *targets)
+            else:
+                values = np.empty((2, stop - start, nx))
+                function(start, stop, *values)
                 ra[start:stop], dec[start:stop] = values
 
     run_blocks(fill, math.ceil(ny / band), weight=band * nx)
     return ra, dec
 
 
-# Pixels in a band of rows that a thread takes, and in a piece of it that is worked on at a time.
+# Pixels in a band of rows that a thread takes.
 _BAND_SIZE = 524_288
-_PIECE_SIZE = 65_536
 
 
-def _any_rows(transform, x):
-    """Return a function for whole rows of any transform."""
-    return lambda y: transform(*np.broadcast_arrays(x, y[:, np.newaxis]))
+def _any_rows(transform, x, y):
+    """Return a function for rows of any transform."""
+
+    def function(start, stop, ra, dec):
+        with np.errstate(all="ignore"):
+            ra[...], dec[...] = transform(*np.broadcast_arrays(x, y[start:stop, np.newaxis]))
+
+    return function
 
 
 def to_stock_wcs(wcs):

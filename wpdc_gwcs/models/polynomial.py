@@ -184,7 +184,7 @@ class PVPolynomial(FittableModel):
             Corrected coordinates in degrees.
         """
         coefficients = np.array([np.ravel(c)[0] for c in coefficients], dtype=float)
-        return evaluate_blocks(self._plane_map(coefficients.reshape(2, -1)), xi, eta)
+        return evaluate_blocks(self._plane_map(coefficients.reshape(2, -1)).evaluate, xi, eta)
 
     def design_matrix(self, xi, eta):
         """Return the derivatives of both outputs by their coefficients, as columns in FITS order.
@@ -235,7 +235,7 @@ class PVPolynomial(FittableModel):
             ``jacobian[i, j]`` is the derivative of output i by input j.
         """
         plane_map = self._plane_map(self.coefficients)
-        rows = evaluate_blocks(lambda a, b: plane_map.jacobian(a, b)[1], xi, eta, n_outputs=4)
+        rows = evaluate_blocks(plane_map.jacobian, xi, eta, n_outputs=6)[2:]
         return np.array(rows).reshape(2, 2, *rows[0].shape)
 
     @property
@@ -284,11 +284,7 @@ class PVInverse(Model):
             Intermediate world coordinates in degrees.
         """
         plane_map = self.polynomial._plane_map(self.polynomial.coefficients)
-
-        def invert(a, b):
-            return plane_map.invert(a, b, tolerance=_TOLERANCE_DEG)
-
-        return evaluate_blocks(invert, xi, eta)
+        return evaluate_blocks(plane_map.inverse(tolerance=_TOLERANCE_DEG), xi, eta)
 
     @property
     def inverse(self):
