@@ -155,7 +155,7 @@ def sky(crval, rng):
     lookup_table = LookupTable(nodes, nodes, *rng.normal(scale=1e-3, size=(2, 9, 9)))
     wcs = build_wcs(crpix=crpix, cd=cd, crval=crval, lookup_table=lookup_table)
     distortion, tangent = (step.transform for step in wcs.pipeline[:-1])
-    return tangent._after(distortion._plane_map()), tangent.inverse._numbers()
+    return tangent._after(distortion._plane_map())
 
 
 CRVALS = [(120.0, 30.0), (0.0, 0.0), (359.99, -60.0), (-10.0, 89.9), (33.0, 90.0), (10.0, -90.0)]
@@ -163,7 +163,7 @@ CRVALS = [(120.0, 30.0), (0.0, 0.0), (359.99, -60.0), (-10.0, 89.9), (33.0, 90.0
 
 @pytest.mark.parametrize("crval", CRVALS)
 def test_skies_have_the_same_bits(crval, compiled, rng):
-    to_sky, tangent = sky(crval, rng)
+    to_sky = sky(crval, rng)
     x, y = points(rng)
     # Nearly whole numbers of cells are quick; what lies outside them takes the long way.
     cells = to_sky._cells
@@ -171,21 +171,21 @@ def test_skies_have_the_same_bits(crval, compiled, rng):
     box = box_numbers(((-0.5, N - 0.5), (-0.5, N - 200.0)), -1.0)
     for limit in (None, box):
         args = (to_sky._tangent, limit, x, y, x.shape)
-        found, expected = both(compiled, "to_sky", 2, [to_sky._plane, cells], *args)
+        found, expected = both(compiled, "to_sky", 2, [to_sky._to_plane.plane, cells], *args)
         assert_same_bits(found, expected)
-    found, expected = both(compiled, "to_sky", 2, [to_sky._plane, None], *args)
+    found, expected = both(compiled, "to_sky", 2, [to_sky._to_plane.plane, None], *args)
     assert_same_bits(found, expected)
-    args = (tangent, *expected, x.shape)
+    args = (to_sky._tangent, *expected, x.shape)
     assert_same_bits(*both(compiled, "from_sky", 2, [], *args))
 
 
 @pytest.mark.parametrize("crval", CRVALS)
 @pytest.mark.parametrize("kind", ["cells", "polynomial"])
 def test_rows_have_the_same_bits(crval, kind, compiled, rng):
-    to_sky, _ = sky(crval, rng)
+    to_sky = sky(crval, rng)
     x, y = np.arange(300.0), np.arange(40.0, 451.0)
     plane = (
-        to_sky._plane
+        to_sky._to_plane.plane
         if kind == "cells"
         else make_map(kind, rng).transformed(np.eye(2) * 1e-5).plane
     )
@@ -211,6 +211,12 @@ def test_all_angles_have_the_same_bits(compiled, rng):
 # ---- the truth -------------------------------------------------------------------------------
 
 
+needs_more_digits = pytest.mark.skipif(
+    np.finfo(np.longdouble).eps > 1e-17, reason="no floating-point type with more digits"
+)
+
+
+@needs_more_digits
 def test_sine_and_cosine(rng):
     angle = np.concatenate([rng.uniform(-360, 360, 20_000), np.arange(-360.0, 361.0, 15)])
     sine, cosine = in_numpy._sin_cos(angle)
@@ -223,6 +229,7 @@ def test_sine_and_cosine(rng):
     assert np.isnan(in_numpy._sin_cos(np.array([np.nan, np.inf, 1e10]))).all()
 
 
+@needs_more_digits
 def test_arc_tangent(rng):
     length = 10 ** rng.uniform(-12, 3, 20_000)
     direction = np.radians(rng.uniform(-180, 180, 20_000))

@@ -14,15 +14,12 @@ from astropy.modeling import Model, Parameter
 
 from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.models.lookup_table import LookupTable
-from wpdc_gwcs.models.mapping import PlaneMap
+from wpdc_gwcs.models.mapping import TOLERANCE_PX, PlaneMap
 from wpdc_gwcs.models.polynomial import PVPolynomial
 from wpdc_gwcs.models.powers import expand_pv
 from wpdc_gwcs.models.tangent import check_invertible
 
 __all__ = ["DetectorToSky", "DistortionCorrection", "DistortionInverse", "SkyToDetector"]
-
-# Residual of the inverse in undistorted pixels; Newton's last step leaves far less.
-_TOLERANCE_PX = 1e-9
 
 
 class DistortionCorrection(Model):
@@ -146,13 +143,12 @@ class DistortionCorrection(Model):
         """Return the map on blocks, kept until a parameter, the polynomial or the table changes."""
         if crpix is None:
             crpix, cd = self.crpix.value, self.cd.value
-        pv = self._pv
-        numbers = np.concatenate([np.ravel(crpix), np.ravel(cd), pv.parameters])
         cells = None if self._lookup_table is None else self._lookup_table._cells()
+        key = (crpix.tobytes(), cd.tobytes(), self._pv._values())
         cache = self._cache
-        if cache is not None and cache[1] is cells and np.array_equal(cache[0], numbers):
+        if cache is not None and cache[1] is cells and cache[0] == key:
             return cache[2]
-        crpix, cd = numbers[:2], numbers[2:6].reshape(2, 2)
+        crpix, cd = np.reshape(crpix, 2), np.reshape(cd, (2, 2))
         polynomial, radial = self._expand(crpix, cd)
         plane_map = PlaneMap(
             polynomial,
@@ -161,7 +157,7 @@ class DistortionCorrection(Model):
             radial_matrix=cd,
             grid=None if cells is None else cells.transformed(-np.eye(2)),
         )
-        self._cache = (numbers, cells, plane_map)
+        self._cache = (key, cells, plane_map)
         return plane_map
 
     def _expand(self, crpix, cd):
@@ -264,7 +260,7 @@ class DistortionInverse(Model):
         x, y : ndarray
             Detector pixel coordinates, zero based; NaN where there is no answer.
         """
-        invert = self.distortion._plane_map().inverse(tolerance=_TOLERANCE_PX)
+        invert = self.distortion._plane_map().inverse(tolerance=TOLERANCE_PX)
         return evaluate_blocks(invert, x, y)
 
     @property
@@ -337,8 +333,7 @@ class DetectorToSky(Model):
         function : callable
             ``function(x, y, ra, dec)`` writes positions in degrees.
         """
-        to_sky = self.sky._after(self.distortion._plane_map())
-        return to_sky.block_function(box, fill_value)
+        return self.sky._after(self.distortion._plane_map()).to_sky(box, fill_value)
 
     def row_function(self, x, y):
         """Return the map as a function of whole rows of an image.
@@ -417,12 +412,7 @@ class SkyToDetector(Model):
         function : callable
             ``function(ra, dec, x, y)`` writes pixels.
         """
-        return self.distortion._plane_map().inverse(
-            tolerance=_TOLERANCE_PX,
-            tangent=self.sky.inverse._numbers(),
-            box=box,
-            fill_value=fill_value,
-        )
+        return self.sky._after(self.distortion._plane_map()).from_sky(box, fill_value)
 
     @property
     def inverse(self):

@@ -19,7 +19,13 @@ from wpdc_gwcs import kernels
 from wpdc_gwcs.models.cells import spline_cells
 from wpdc_gwcs.models.powers import derivative, fit_polynomial
 
-__all__ = ["PlaneMap"]
+__all__ = ["RIM_PX", "TOLERANCE_PX", "PlaneMap"]
+
+#: Answers this far (px) outside a bounding box lie on its rim but for rounding.
+RIM_PX = 1e-6
+
+#: Residual of the inverse in undistorted pixels; Newton's last step leaves far less.
+TOLERANCE_PX = 1e-9
 
 # The fit that the start of the inversion is made with: degree, and points along each axis.  It
 # leaves a few px of a distortion of 200 px.
@@ -29,9 +35,6 @@ _FIT_NODES = 17
 # The spline that starts the inversion: nodes along each axis, and the residual it is solved to.
 _SPLINE_NODES = 65
 _SPLINE_TOLERANCE = 1e-6
-
-# Answers this far (px) outside a bounding box lie on its rim but for rounding.
-_RIM_PX = 1e-6
 
 _NOTHING = np.empty(0)
 
@@ -190,7 +193,7 @@ class PlaneMap:
         where the Jacobian determinant has another sign than in the middle (the image is folded over
         there) is no answer.
         """
-        limits = np.array([tolerance, self._curvature, self._orientation, _RIM_PX])
+        limits = np.array([tolerance, self._curvature, self._orientation, RIM_PX])
         return self._inverse(self._start, limits, tangent, kernels.box_numbers(box, fill_value))
 
     def _inverse(self, start, limits, tangent, box):
@@ -259,7 +262,7 @@ class PlaneMap:
         a, b = (value.ravel() for value in np.meshgrid(a_grid, b_grid))
         nodes = np.array(fit(a, b))
         first = spline_cells(a_grid, b_grid, nodes.reshape(2, _SPLINE_NODES, _SPLINE_NODES))
-        limits = np.array([_SPLINE_TOLERANCE, self._curvature, self._orientation, _RIM_PX])
+        limits = np.array([_SPLINE_TOLERANCE, self._curvature, self._orientation, RIM_PX])
         solved = np.empty_like(nodes)
         self._inverse(PlaneMap(grid=first).plane, limits, None, None)(a, b, *solved)
         nodes = np.where(np.isfinite(solved), solved, nodes)

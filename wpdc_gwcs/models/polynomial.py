@@ -1,5 +1,7 @@
 """The PV (TPV) polynomial in intermediate world coordinates and its exact inverse."""
 
+from operator import attrgetter
+
 import numpy as np
 from astropy.modeling import FittableModel, Model
 from astropy.modeling.parameters import Parameter
@@ -163,6 +165,10 @@ class PVPolynomial(FittableModel):
     def coefficients(self):
         """Coefficients as a (2, n_terms) array in the order of `term_indices` (a copy)."""
         return np.array(self.parameters).reshape(2, -1)
+
+    def _values(self):
+        """Return all coefficients, quickly, to tell whether they are still the same."""
+        return [parameter.value for parameter in attrgetter(*self._param_names)(self)]
 
     def _plane_map(self, coefficients):
         polynomial, radial = expand_pv(coefficients, self._degree, self._radial, np.eye(2))

@@ -1,11 +1,13 @@
 """The tangent plane: gnomonic projection about a point of the sky, and its model."""
 
+from functools import cached_property
+
 import numpy as np
 from astropy.modeling import Model, Parameter
 
 from wpdc_gwcs import kernels
 from wpdc_gwcs.models.blocks import evaluate_blocks
-from wpdc_gwcs.models.mapping import PlaneMap
+from wpdc_gwcs.models.mapping import TOLERANCE_PX, PlaneMap
 
 __all__ = ["SkyTangent", "TangentSky", "deproject", "local_plane", "project"]
 
@@ -207,13 +209,10 @@ class TangentSky(_Linear):
         It is kept for as long as it is asked for with the same map and the same parameters.
         """
         crpix, cd, crval = self.crpix.value, self.cd.value, self.crval.value
-        numbers = np.concatenate([crpix, np.ravel(cd), crval])
+        key = (crpix.tobytes(), cd.tobytes(), crval.tobytes())
         cache = self._cache
-        if cache is None or cache[0] is not plane_map or not np.array_equal(cache[1], numbers):
-            matrix = np.radians(cd)
-            to_plane = plane_map.transformed(matrix, -matrix @ crpix)
-            to_sky = _SkyMap(to_plane, crval, np.sqrt(abs(np.linalg.det(cd))))
-            cache = self._cache = (plane_map, numbers, to_sky)
+        if cache is None or cache[0] is not plane_map or cache[1] != key:
+            cache = self._cache = (plane_map, key, _SkyMap(plane_map, crpix, cd, crval))
         return cache[2]
 
     def __getstate__(self):
@@ -231,30 +230,54 @@ _MOST_CELLS = 40_000
 
 
 class _SkyMap:
-    """The whole way to the sky on blocks: a map to the tangent plane in radians, then the sphere.
+    """The whole way to the sky and back, on blocks: a map of the plane, the sphere behind it.
 
     Where cells lead to the sky itself as well as that, they are used for what lies inside them.
     """
 
-    def __init__(self, to_plane, crval, scale):
-        self._plane = to_plane.plane
-        self._tangent = kernels.tangent_numbers(crval)
-        self._grid = _cells_to_sky(to_plane, self._tangent, scale)
-        self._cells = None if self._grid is None else PlaneMap(grid=self._grid).plane
+    def __init__(self, plane_map, crpix, cd, crval):
+        self._plane_map = plane_map
+        self._scale = np.sqrt(abs(np.linalg.det(cd)))
+        matrix = np.radians(cd)
+        self._to_plane = plane_map.transformed(matrix, -matrix @ crpix)
+        self._tangent = kernels.tangent_numbers(crval, np.linalg.inv(cd), crpix)
+        # What was asked for last, and its function: a single point takes less than making it.
+        self._last_to_sky = self._last_from_sky = (None, None)
 
-    def block_function(self, box, fill_value):
+    @cached_property
+    def _grid(self):
+        return _cells_to_sky(self._to_plane, self._tangent, self._scale)
+
+    @cached_property
+    def _cells(self):
+        return None if self._grid is None else PlaneMap(grid=self._grid).plane
+
+    def to_sky(self, box, fill_value):
         """Return ``function(x, y, ra, dec)`` for points, with a bounding box or without."""
-        plane, cells, tangent = self._plane, self._cells, self._tangent
-        numbers = kernels.box_numbers(box, fill_value)
+        last = self._last_to_sky
+        if last[0] != (box, fill_value):
+            plane, cells, tangent = self._to_plane.plane, self._cells, self._tangent
+            numbers = kernels.box_numbers(box, fill_value)
 
-        def function(x, y, ra, dec):
-            kernels.to_sky(plane, cells, tangent, numbers, x, y, ra, dec)
+            def function(x, y, ra, dec):
+                kernels.to_sky(plane, cells, tangent, numbers, x, y, ra, dec)
 
-        return function
+            last = self._last_to_sky = ((box, fill_value), function)
+        return last[1]
+
+    def from_sky(self, box, fill_value):
+        """Return ``function(ra, dec, x, y)`` for points, with a bounding box or without."""
+        last = self._last_from_sky
+        if last[0] != (box, fill_value):
+            function = self._plane_map.inverse(
+                tolerance=TOLERANCE_PX, tangent=self._tangent, box=box, fill_value=fill_value
+            )
+            last = self._last_from_sky = ((box, fill_value), function)
+        return last[1]
 
     def row_function(self, x, y):
         """Return ``function(start, stop, ra, dec)`` for rows of an image."""
-        plane, tangent = self._plane, self._tangent
+        plane, tangent = self._to_plane.plane, self._tangent
         cells = self._cells if self._grid is not None and self._grid.covers(x, y) else None
 
         def function(start, stop, ra, dec):
@@ -331,12 +354,6 @@ class SkyTangent(_Linear):
         """
         crpix, cd, crval = self._arrays(crpix, cd, crval)
         return evaluate_blocks(_projection(crval, np.linalg.inv(cd), crpix), ra, dec)
-
-    def _numbers(self):
-        """Return the parameters as kernels take them."""
-        return kernels.tangent_numbers(
-            self.crval.value, np.linalg.inv(self.cd.value), self.crpix.value
-        )
 
     @property
     def inverse(self):
