@@ -1,8 +1,9 @@
-"""The inner loops of the WCS: compiled where there was a compiler, the same in NumPy elsewhere.
+"""The inner loops: compiled where there was a compiler, the same in NumPy elsewhere.
 
 `implementation` says which of the two is at work, ``"compiled"`` or ``"numpy"``; this module is the
 only one that knows.  The environment variable ``WPDC_GWCS_KERNELS=numpy`` asks for NumPy.  Both do
-the same operations in the same order, so the results are the same to the last bit.
+the same; those of the WCS do the same operations in the same order, so that their results have the
+same bits, those of stars agree to rounding.
 """
 
 import os
@@ -23,7 +24,10 @@ __all__ = [
     "implementation",
     "invert",
     "jacobian",
+    "paint_stars",
     "rows_to_sky",
+    "star_profiles",
+    "star_steps",
     "tangent_numbers",
     "to_sky",
 ]
@@ -52,5 +56,8 @@ evaluate = _kernels.evaluate
 from_sky = _kernels.from_sky
 invert = _kernels.invert
 jacobian = _kernels.jacobian
+paint_stars = _kernels.paint_stars
 rows_to_sky = _kernels.rows_to_sky
+star_profiles = _kernels.star_profiles
+star_steps = _kernels.star_steps
 to_sky = _kernels.to_sky

@@ -8,9 +8,11 @@
 #define Py_LIMITED_API 0x030B0000
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
+#include <stdlib.h>
 
 #include "inverse.h"
 #include "sky.h"
+#include "stars.h"
 
 /* ---- the loops ------------------------------------------------------------------------------ */
 
@@ -76,6 +78,52 @@ static void run_invert(const Inverse *inverse, const double *a, const double *b,
     EACH_BLOCK(k, size, n) invert_block(inverse, a + k, b + k, n, x + k, y + k);
 }
 
+#define N_PHASE 18
+
+INLINE Phase phase_of(const double *phases, const double *shares, ptrdiff_t n_shares,
+                      ptrdiff_t star) {
+    const double *p = phases + N_PHASE * star;
+    const Phase phase = {p[0],  p[9],   p + 1,  p + 5,
+                         p + 10, p + 14, shares + n_shares * star};
+    return phase;
+}
+
+FOR_ANY_PROCESSOR
+static void run_profiles(const Spline *spline, const double *phases, const double *shares,
+                         ptrdiff_t half, ptrdiff_t size, int gradient, double *profiles) {
+    const ptrdiff_t n = (2 * half + 1) * (2 * half + 1);
+    for (ptrdiff_t k = 0; k < size; k++) {
+        const Phase phase = phase_of(phases, shares, spline->n_grids, k);
+        double *value = profiles + k * n, *by_x = NULL, *by_y = NULL;
+        if (gradient) by_x = value + size * n, by_y = by_x + size * n;
+        star_pixels(spline, &phase, half, gradient, value, by_x, by_y);
+    }
+}
+
+FOR_ANY_PROCESSOR
+static void run_paint(const Spline *spline, const double *phases, const double *shares,
+                      ptrdiff_t half, const double *centers, const double *flux, ptrdiff_t size,
+                      float *image, ptrdiff_t ny, ptrdiff_t nx) {
+    for (ptrdiff_t k = 0; k < size; k++) {
+        const Phase phase = phase_of(phases, shares, spline->n_grids, k);
+        paint_star(spline, &phase, centers[2 * k], centers[2 * k + 1], flux[k], half, image, ny,
+                   nx);
+    }
+}
+
+FOR_ANY_PROCESSOR
+static void run_steps(const double *profiles, const double *flux, const double *pixels,
+                      const unsigned char *use, const double *variance, const double *photons,
+                      NoiseNumbers noise, ptrdiff_t size, ptrdiff_t n, double *step,
+                      double *covariance, double *chi2) {
+    for (ptrdiff_t k = 0; k < size; k++) {
+        const double *value = profiles + k * n, *by_x = value + size * n, *by_y = by_x + size * n;
+        star_step(value, by_x, by_y, flux[k], pixels + k * n, use + k * n, variance + k * n,
+                  photons ? photons + k * n : NULL, noise, n, step + 3 * k, covariance + 9 * k,
+                  chi2 + k);
+    }
+}
+
 /* ---- arguments ------------------------------------------------------------------------------ */
 
 #define MOST_BUFFERS 24
@@ -89,20 +137,26 @@ static void release(Buffers *held) {
     while (held->n) PyBuffer_Release(&held->views[--held->n]);
 }
 
-/* Return the numbers of a contiguous float64 array, NULL with an exception set if it is none. */
-static double *numbers(Buffers *held, PyObject *object, int writable, ptrdiff_t *size) {
+/* Return the memory of a contiguous array of one type, NULL with an exception set if it is none. */
+static void *memory(Buffers *held, PyObject *object, char type, size_t width, int writable,
+                    ptrdiff_t *size) {
     Py_buffer *view = &held->views[held->n];
     int flags = PyBUF_FORMAT | PyBUF_C_CONTIGUOUS | (writable ? PyBUF_WRITABLE : 0);
     if (PyObject_GetBuffer(object, view, flags) < 0) return NULL;
     held->n++;
     const char *format = view->format ? view->format : "B";
     if (*format == '@' || *format == '=') format++;
-    if (view->itemsize != sizeof(double) || format[0] != 'd' || format[1] != '\0') {
-        PyErr_SetString(PyExc_TypeError, "kernels take contiguous arrays of float64");
+    if ((size_t)view->itemsize != width || format[0] != type || format[1] != '\0') {
+        PyErr_Format(PyExc_TypeError, "kernels take contiguous arrays of the type '%c' here", type);
         return NULL;
     }
-    *size = view->len / (ptrdiff_t)sizeof(double);
+    *size = view->len / (ptrdiff_t)width;
     return view->buf;
+}
+
+/* The numbers of a contiguous float64 array. */
+static double *numbers(Buffers *held, PyObject *object, int writable, ptrdiff_t *size) {
+    return memory(held, object, 'd', sizeof(double), writable, size);
 }
 
 /* The same for an array of known size. */
@@ -320,11 +374,126 @@ static PyObject *invert(PyObject *self, PyObject *const *args, Py_ssize_t n_args
     return finish(&held, size >= 0);
 }
 
+/* The point-spread function: grids, oversampling, phases, shares, half; number of stars or -1.
+ * Its work space is the caller's to free. */
+static ptrdiff_t read_stars(Buffers *held, PyObject *const *args, Spline *spline,
+                            const double **phases, const double **shares, ptrdiff_t *half) {
+    ptrdiff_t n_knots, n_phases, n_shares;
+    if (!(spline->grids = numbers(held, args[0], 0, &n_knots))) return -1;
+    const Py_buffer *view = &held->views[held->n - 1];
+    spline->oversampling = PyNumber_AsSsize_t(args[1], PyExc_OverflowError);
+    if (!(*phases = numbers(held, args[2], 0, &n_phases))) return -1;
+    if (!(*shares = numbers(held, args[3], 0, &n_shares))) return -1;
+    *half = PyNumber_AsSsize_t(args[4], PyExc_OverflowError);
+    if (PyErr_Occurred()) return -1;
+    const ptrdiff_t n_stars = n_phases / N_PHASE;
+    const int good = view->ndim == 3 && view->shape[1] == view->shape[2];
+    spline->n_grids = good ? view->shape[0] : 0, spline->size = good ? view->shape[1] : 0;
+    if (!good || n_phases != N_PHASE * n_stars || n_shares != n_stars * spline->n_grids ||
+        spline->oversampling < 1 || spline->oversampling > 1000 || *half < 0 || *half > 100000) {
+        PyErr_SetString(PyExc_ValueError, "the arrays make no stars");
+        return -1;
+    }
+    spline->line = malloc(3 * sizeof(double) * (size_t)columns_of(spline->oversampling, *half));
+    if (!spline->line) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    return n_stars;
+}
+
+static PyObject *star_profiles(PyObject *self, PyObject *const *args, Py_ssize_t n_args) {
+    Buffers held = {.n = 0};
+    Spline spline = {.line = NULL};
+    const double *phases, *shares;
+    double *profiles;
+    ptrdiff_t half, n_stars, n_out;
+    int good = 0;
+    (void)self;
+    if (count(n_args, 6) == 0 &&
+        (n_stars = read_stars(&held, args, &spline, &phases, &shares, &half)) >= 0 &&
+        (profiles = numbers(&held, args[5], 1, &n_out))) {
+        const ptrdiff_t n = n_stars * (2 * half + 1) * (2 * half + 1);
+        if (n_out != n && n_out != 3 * n) {
+            PyErr_SetString(PyExc_ValueError, "the profiles have another size");
+        } else {
+            Py_BEGIN_ALLOW_THREADS
+            run_profiles(&spline, phases, shares, half, n_stars, n_out != n, profiles);
+            Py_END_ALLOW_THREADS
+            good = 1;
+        }
+    }
+    free(spline.line);
+    return finish(&held, good);
+}
+
+static PyObject *paint_stars(PyObject *self, PyObject *const *args, Py_ssize_t n_args) {
+    Buffers held = {.n = 0};
+    Spline spline = {.line = NULL};
+    const double *phases, *shares, *centers, *flux;
+    float *image;
+    ptrdiff_t half, n_stars, n_image;
+    int good = 0;
+    (void)self;
+    if (count(n_args, 8) == 0 &&
+        (n_stars = read_stars(&held, args, &spline, &phases, &shares, &half)) >= 0 &&
+        (centers = exactly(&held, args[5], 0, 2 * n_stars)) &&
+        (flux = exactly(&held, args[6], 0, n_stars)) &&
+        (image = memory(&held, args[7], 'f', sizeof(float), 1, &n_image))) {
+        const Py_buffer *view = &held.views[held.n - 1];
+        if (view->ndim != 2) {
+            PyErr_SetString(PyExc_ValueError, "the image must have two dimensions");
+        } else {
+            const ptrdiff_t ny = view->shape[0], nx = view->shape[1];
+            Py_BEGIN_ALLOW_THREADS
+            run_paint(&spline, phases, shares, half, centers, flux, n_stars, image, ny, nx);
+            Py_END_ALLOW_THREADS
+            good = 1;
+        }
+    }
+    free(spline.line);
+    return finish(&held, good);
+}
+
+static PyObject *star_steps(PyObject *self, PyObject *const *args, Py_ssize_t n_args) {
+    Buffers held = {.n = 0};
+    const double *profiles, *flux, *pixels, *variance, *photons = NULL, *noise;
+    const unsigned char *use;
+    double *step, *covariance, *chi2;
+    ptrdiff_t n_all, n_stars, n_use;
+    int good = 0;
+    (void)self;
+    if (count(n_args, 10) == 0 && (pixels = numbers(&held, args[2], 0, &n_all)) &&
+        (flux = numbers(&held, args[1], 0, &n_stars)) &&
+        (profiles = exactly(&held, args[0], 0, 3 * n_all)) &&
+        (use = memory(&held, args[3], '?', 1, 0, &n_use)) &&
+        (variance = exactly(&held, args[4], 0, n_all)) &&
+        (args[5] == Py_None || (photons = exactly(&held, args[5], 0, n_all))) &&
+        (noise = exactly(&held, args[6], 0, 2)) &&
+        (step = exactly(&held, args[7], 1, 3 * n_stars)) &&
+        (covariance = exactly(&held, args[8], 1, 9 * n_stars)) &&
+        (chi2 = exactly(&held, args[9], 1, n_stars))) {
+        const ptrdiff_t n = n_stars ? n_all / n_stars : 0;
+        if (n * n_stars != n_all || n_use != n_all) {
+            PyErr_SetString(PyExc_ValueError, "the pixels have another size");
+        } else {
+            const NoiseNumbers numbers_of = {noise[0], noise[1]};
+            Py_BEGIN_ALLOW_THREADS
+            run_steps(profiles, flux, pixels, use, variance, photons, numbers_of, n_stars, n, step,
+                      covariance, chi2);
+            Py_END_ALLOW_THREADS
+            good = 1;
+        }
+    }
+    return finish(&held, good);
+}
+
 #define METHOD(name) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, NULL}
 
 static PyMethodDef methods[] = {
     METHOD(evaluate), METHOD(jacobian), METHOD(to_sky), METHOD(rows_to_sky),
-    METHOD(from_sky), METHOD(invert),   {NULL, NULL, 0, NULL},
+    METHOD(from_sky), METHOD(invert),   METHOD(star_profiles), METHOD(paint_stars),
+    METHOD(star_steps), {NULL, NULL, 0, NULL},
 };
 
 static struct PyModuleDef module = {

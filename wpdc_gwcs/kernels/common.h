@@ -1,6 +1,6 @@
 /* What all kernels have in common.
  *
- * Every kernel is the same sequence of additions, multiplications, divisions, square roots and
+ * Every kernel of the WCS is the same sequence of additions, multiplications, divisions, square roots and
  * comparisons as its counterpart in in_numpy.py, and is compiled without contraction to fused
  * operations: the results have the same bits.  Whoever changes one changes the other;
  * tests/test_kernels.py compares them.

@@ -5,11 +5,25 @@ from wpdc_gwcs.kernels._compiled import (
     from_sky,
     invert,
     jacobian,
+    paint_stars,
     rows_to_sky,
+    star_profiles,
+    star_steps,
     to_sky,
 )
 
-__all__ = ["CELL_ORDER", "evaluate", "from_sky", "invert", "jacobian", "rows_to_sky", "to_sky"]
+__all__ = [
+    "CELL_ORDER",
+    "evaluate",
+    "from_sky",
+    "invert",
+    "jacobian",
+    "paint_stars",
+    "rows_to_sky",
+    "star_profiles",
+    "star_steps",
+    "to_sky",
+]
 
 #: Cells in memory, ``[j, i, q, k, p]``: all of a cell side by side, four cache lines.
 CELL_ORDER = "jiqkp"

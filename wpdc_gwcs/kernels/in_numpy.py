@@ -1,4 +1,4 @@
-"""The kernels in NumPy, for installations without a compiler.
+"""The kernels of the WCS in NumPy, for installations without a compiler.
 
 Operation by operation the same as the C sources beside it, so that the results have the same bits.
 Whoever changes one changes the other; the tests compare them.
@@ -9,7 +9,20 @@ import threading
 
 import numpy as np
 
-__all__ = ["CELL_ORDER", "evaluate", "from_sky", "invert", "jacobian", "rows_to_sky", "to_sky"]
+from wpdc_gwcs.kernels.stars_in_numpy import paint_stars, star_profiles, star_steps
+
+__all__ = [
+    "CELL_ORDER",
+    "evaluate",
+    "from_sky",
+    "invert",
+    "jacobian",
+    "paint_stars",
+    "rows_to_sky",
+    "star_profiles",
+    "star_steps",
+    "to_sky",
+]
 
 #: Cells in memory, ``[q, k, j, i, p]``: the four powers of s side by side, since fetching them 32
 #: bytes at a time is what costs least, and both outputs in one array, for half as many calls.
