@@ -68,8 +68,16 @@ def paint_stars(grids, oversampling, phase, shares, half, center, flux, image):
 
     Parameters
     ----------
-    grids, oversampling, phase, shares, half
-        As for `star_profiles`.
+    grids : (R, M, M) ndarray
+        This and the next four as for `star_profiles`.
+    oversampling : int
+        Knots per pixel.
+    phase : (N, 18) ndarray
+        Knots and their weights.
+    shares : (N, R) ndarray
+        Shares of the grids.
+    half : int
+        The cut-outs are 2 half + 1 px wide.
     center : (N, 2) ndarray
         Central pixels of the cut-outs, x and y.
     flux : (N,) ndarray
