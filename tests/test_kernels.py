@@ -135,6 +135,17 @@ def test_inverses_have_the_same_bits(kind, compiled, rng):
     assert_allclose(found[1][inside], y[inside], atol=1e-8)
 
 
+def test_inverses_from_a_polynomial_have_the_same_bits(compiled, rng):
+    plane_map = make_map("cells", rng)
+    images = plane_map(*points(rng))
+    limits = np.array([1e-9, plane_map._curvature, plane_map._orientation, 1e-6])
+    start = PlaneMap(polynomial(1, rng), (N / 2, N / 2)).plane
+    args = (limits, None, None, *images, images[0].shape)
+    found, expected = both(compiled, "invert", 2, [plane_map.plane, start], *args)
+    assert np.isfinite(expected).sum() > 5000
+    assert_same_bits(found, expected)
+
+
 def test_folded_images_have_the_same_bits(compiled, rng):
     # Where the image is folded over Newton's method wanders, and finds what it must not find.
     wild = polynomial(3, rng)

@@ -84,9 +84,8 @@ class DetectorWCS(WCS):
             box = distortion.bounding_box
         except NotImplementedError:
             return None
-        if isinstance(box, ModelBoundingBox):
-            intervals = box.intervals
-            return intervals[0], intervals[1]
+        if isinstance(box, ModelBoundingBox) and len(box.intervals) == 2:
+            return box.intervals[0], box.intervals[1]
         return box.bounding_box(order="F")
 
     def __call__(self, *args, with_bounding_box=True, fill_value=np.nan, **kwargs):

@@ -354,22 +354,17 @@ static PyObject *invert(PyObject *self, PyObject *const *args, Py_ssize_t n_args
         (args[3] == Py_None || read_tangent(&held, args[3], &tangent) == 0) &&
         (args[4] == Py_None || read_box(&held, args[4], &box) == 0) &&
         (size = read_points(&held, args + 5, 2, p)) >= 0) {
-        if (args[1] != Py_None && !start.table) {
-            PyErr_SetString(PyExc_ValueError, "the start must have cells");
-            size = -1;
-        } else {
-            const Inverse inverse = {.plane = &plane,
-                                     .start = args[1] == Py_None ? NULL : &start,
-                                     .sky = args[3] == Py_None ? NULL : &tangent,
-                                     .box = args[4] == Py_None ? NULL : &box,
-                                     .tolerance = limits[0],
-                                     .curvature = limits[1],
-                                     .sign = limits[2],
-                                     .rim = limits[3]};
-            Py_BEGIN_ALLOW_THREADS
-            run_invert(&inverse, p[0], p[1], size, p[2], p[3]);
-            Py_END_ALLOW_THREADS
-        }
+        const Inverse inverse = {.plane = &plane,
+                                 .start = args[1] == Py_None ? NULL : &start,
+                                 .sky = args[3] == Py_None ? NULL : &tangent,
+                                 .box = args[4] == Py_None ? NULL : &box,
+                                 .tolerance = limits[0],
+                                 .curvature = limits[1],
+                                 .sign = limits[2],
+                                 .rim = limits[3]};
+        Py_BEGIN_ALLOW_THREADS
+        run_invert(&inverse, p[0], p[1], size, p[2], p[3]);
+        Py_END_ALLOW_THREADS
     }
     return finish(&held, size >= 0);
 }

@@ -556,7 +556,7 @@ def invert(plane, start, limits, tangent, box, a, b, x, y):
     plane : Plane
         The map.
     start : Plane or None
-        Cells of an approximate inverse; the images themselves by default.
+        An approximate inverse, where to start; the images themselves for `None`.
     limits : (4,) ndarray
         Greatest residual, bound of the second derivatives inside the cells, sign of the Jacobian
         determinant in the middle, and how far outside the box answers are put on its rim.
@@ -591,8 +591,10 @@ def _hold(values, low, high):
 def _solve_near_and_far(plane, start, limits, a, b, index, x_out, y_out):
     x, y = a, b
     if start is not None:
-        # Held at the edge: what lies farther out has no answer anyway.
-        x, y = _cells(start, _hold(a, *start.head[:2]), _hold(b, *start.head[3:5]))
+        if start.table.size:
+            # Held at the edge: what lies farther out has no answer anyway.
+            x, y = _hold(a, *start.head[:2]), _hold(b, *start.head[3:5])
+        x, y = _values(start, x, y)
     if plane.table.size:
         x, y = _hold_near(plane, x, y)
         _solve(plane, limits, a, b, x, y, index, x_out, y_out, bounded=True)

@@ -10,7 +10,7 @@
 
 typedef struct {
     const Plane *plane;
-    const Plane *start; /* cells of an approximate inverse; NULL: the images themselves */
+    const Plane *start; /* approximate inverse; NULL: the images themselves */
     const Tangent *sky; /* NULL: images are given, not positions on the sky */
     const Box *box;     /* NULL: answers anywhere */
     double rim;         /* answers this far outside the box are put on its rim */
@@ -127,13 +127,15 @@ INLINE void invert_block(const Inverse *inverse, const double *restrict a_given,
         index[n_good] = (int)k;
         n_good += (isfinite(a[k]) != 0) & (isfinite(b[k]) != 0);
     }
-    if (start) {
+    if (start && start->table) {
         /* Held at the edge: what lies farther out has no answer anyway. */
         for (ptrdiff_t k = 0; k < n; k++) {
             a_held[k] = hold(a[k], start->x_low, start->x_high);
             b_held[k] = hold(b[k], start->y_low, start->y_high);
         }
-        cells_block(start, a_held, b_held, n, 0, x_start, y_start);
+        plane_block(start, a_held, b_held, n, x_start, y_start);
+    } else if (start) {
+        plane_block(start, a, b, n, x_start, y_start);
     }
     if (plane->table) {
         const double margin = plane->x_step > plane->y_step ? plane->x_step : plane->y_step;

@@ -119,7 +119,8 @@ class CellGrid:
         offset : (2,) array_like, optional
             Offset.
         """
-        coefficients = np.einsum("ij,j...->i...", matrix, self.coefficients)
+        a, b = self.coefficients
+        coefficients = np.stack([row[0] * a + row[1] * b for row in np.asarray(matrix)])
         coefficients[:, 0, 0] += np.reshape(offset, (2, 1, 1))
         return CellGrid(self.x_range, self.y_range, coefficients, smooth=self.smooth)
 
@@ -174,11 +175,14 @@ class CellGrid:
         """
         if not self.smooth:
             return np.inf
-        p, q = np.arange(4)[:, np.newaxis, np.newaxis, np.newaxis], np.arange(4)[:, None, None]
-        size = np.abs(self.coefficients[..., 1:-1, 1:-1])
-        along_x = (size * p * (p - 1)).sum(axis=(1, 2)).max() / self.x_step**2
-        along_y = (size * q * (q - 1)).sum(axis=(1, 2)).max() / self.y_step**2
-        mixed = (size * p * q).sum(axis=(1, 2)).max() / (self.x_step * self.y_step)
+        p, q = np.arange(4)[:, np.newaxis], np.arange(4)
+        factors = np.broadcast_arrays(
+            p * (p - 1) / self.x_step**2,
+            q * (q - 1) / self.y_step**2,
+            p * q / (self.x_step * self.y_step),
+        )
+        size = np.abs(self.coefficients[..., 1:-1, 1:-1]).reshape(2, 16, -1)
+        along_x, along_y, mixed = (np.reshape(factors, (3, 16)) @ size).max(axis=(0, 2))
         return max(along_x, along_y) + mixed
 
     def fold(self, polynomial, origin):

@@ -260,12 +260,10 @@ class PlaneMap:
         fit = PlaneMap(*fit_polynomial(images, (x, y), _FIT_DEGREE))
         a_grid, b_grid = (np.linspace(v.min(), v.max(), _SPLINE_NODES) for v in images)
         a, b = (value.ravel() for value in np.meshgrid(a_grid, b_grid))
-        nodes = np.array(fit(a, b))
-        first = spline_cells(a_grid, b_grid, nodes.reshape(2, _SPLINE_NODES, _SPLINE_NODES))
         limits = np.array([_SPLINE_TOLERANCE, self._curvature, self._orientation, RIM_PX])
-        solved = np.empty_like(nodes)
-        self._inverse(PlaneMap(grid=first).plane, limits, None, None)(a, b, *solved)
-        nodes = np.where(np.isfinite(solved), solved, nodes)
+        solved = np.empty((2, len(a)))
+        self._inverse(fit.plane, limits, None, None)(a, b, *solved)
+        nodes = np.where(np.isfinite(solved), solved, fit(a, b))
         return PlaneMap(
             grid=spline_cells(a_grid, b_grid, nodes.reshape(2, _SPLINE_NODES, _SPLINE_NODES))
         ).plane
