@@ -19,8 +19,7 @@
 /* Where the linker can choose at run time, code for wider registers goes along with that for any
  * processor of the kind.  Neither has fused operations. */
 #if defined(__x86_64__) && defined(__linux__) && defined(__GLIBC__) && !defined(__AVX2__) && \
-    ((defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 8) || \
-     (defined(__clang__) && __clang_major__ >= 15))
+    defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 8
 #define FOR_ANY_PROCESSOR __attribute__((target_clones("avx2", "default")))
 #else
 #define FOR_ANY_PROCESSOR
