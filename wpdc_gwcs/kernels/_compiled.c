@@ -151,7 +151,8 @@ static void *memory(Buffers *held, PyObject *object, char type, size_t width, in
         return NULL;
     }
     *size = view->len / (ptrdiff_t)width;
-    return view->buf;
+    /* An array without elements need not be anywhere. */
+    return view->buf ? view->buf : view;
 }
 
 /* The numbers of a contiguous float64 array. */

@@ -100,9 +100,10 @@ def evaluate_blocks(function, *inputs, n_outputs=2):
         Of the broadcast shape of the inputs (zero-dimensional for scalars).  Masked arrays, of
         numpy or of astropy, if an input is one.
     """
-    if all(isinstance(value, float) for value in inputs):
+    if all(isinstance(value, (float, int)) for value in inputs):
+        # One point, as in a loop over objects: without all that follows.
         outputs = [np.empty(1) for _ in range(n_outputs)]
-        function(*[np.array((value,)) for value in inputs], *outputs)
+        function(*[np.array((value,), dtype=np.float64) for value in inputs], *outputs)
         return tuple([output.reshape(()) for output in outputs])
     if any(hasattr(value, "mask") for value in inputs):
         return _evaluate_masked(function, inputs, n_outputs)
