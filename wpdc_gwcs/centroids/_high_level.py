@@ -33,6 +33,9 @@ __all__ = ["StarNoise", "build_epsf", "fit_centroids", "measure_noise", "subtrac
 
 log = logging.getLogger(__name__)
 
+# Pixels of an image that are worked on at a time.
+_STRIP = 500_000
+
 # Stars whose residuals tell the error of the PSF.
 _MAX_STARS = 1000
 _MIN_STARS = 8
@@ -44,8 +47,6 @@ _TOLERATED_CHI2 = 1.5
 # Light of neighbors, in standard deviations of the sky, that does not matter to a fit.
 _NEGLIGIBLE = 0.05
 _CHUNK = 10_000
-# Pixels of an image that are worked on at a time.
-_STRIP = 500_000
 # Error of the PSF, relative, below which a residual is no sign of another star.
 _MODEL_ERROR = 0.1
 # Error of the PSF, relative, up to which it is as smooth as its width tells; and the FWHM in px of
