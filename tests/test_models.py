@@ -597,8 +597,9 @@ def test_dask_map_blocks(models):
 
 
 def test_evaluate_blocks_broadcasts():
-    found = evaluate_blocks(
-        lambda a, b: (a + b, a * b), np.arange(3.0)[:, np.newaxis], np.arange(4)
-    )
+    def sum_and_product(a, b, total, product):
+        total[:], product[:] = a + b, a * b
+
+    found = evaluate_blocks(sum_and_product, np.arange(3.0)[:, np.newaxis], np.arange(4))
     assert_allclose(found[0], np.add.outer(np.arange(3), np.arange(4)))
     assert_allclose(found[1], np.multiply.outer(np.arange(3), np.arange(4)))

@@ -1,7 +1,10 @@
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
@@ -42,6 +45,39 @@ def test_wcs_of_both(with_table):
     assert_allclose(with_table.wcs(999.5, 499.5), (10.0, 20.0))
     assert_allclose(frame(with_table).wcs(999.5, 499.5), (11.0, 21.0))
     assert with_table.wcs is with_table.wcs
+
+
+def test_positions_without_the_checks_of_the_wcs(with_table):
+    calibration = frame(with_table)
+    x, y = np.array([[0.0, 500.0, -0.5], [999.25, 1.0, 1999.5]]), np.array([10.0, 999.5, 20.0])
+    sky = calibration.pixel_to_sky(x, y)
+    np.testing.assert_array_equal(sky, calibration.wcs(x, y))
+    np.testing.assert_array_equal(calibration.sky_to_pixel(*sky), calibration.wcs.invert(*sky))
+    # Scalars of any kind, floats in return, NaN off the detector.
+    for pixel in ((10.0, 20.0), (10, 20), (np.float32(10), np.array(20.0)), (10 * u.pix, 20.0)):
+        found = calibration.pixel_to_sky(*pixel)
+        assert [type(value) for value in found] == [float, float]
+        assert found == calibration.wcs(10.0, 20.0)
+    back = calibration.sky_to_pixel(*found)
+    assert [type(value) for value in back] == [float, float]
+    assert_allclose(back, (10.0, 20.0), rtol=0, atol=1e-8)
+    ra, dec = found * u.deg
+    assert calibration.sky_to_pixel(ra.to(u.arcsec), dec.to(u.rad)) == pytest.approx(back)
+    assert np.isnan(
+        [*calibration.pixel_to_sky(-1.0, 5.0), *calibration.sky_to_pixel(0.0, 0.0)]
+    ).all()
+    assert np.isnan(calibration.pixel_to_sky(np.nan, 5.0)).all()
+    masked = calibration.pixel_to_sky(np.ma.array([1.0, 2.0], mask=[True, False]), 3.0)
+    assert masked[0].mask.tolist() == masked[1].mask.tolist() == [True, False]
+
+
+def test_positions_are_those_of_the_calibration_whatever_becomes_of_its_wcs(with_table):
+    calibration = frame(with_table)
+    calibration.wcs.pipeline[1].transform.crval = (1.0, 2.0)
+    assert_allclose(calibration.pixel_to_sky(999.5, 499.5), (11.0, 21.0))
+    for other in (pickle.loads(pickle.dumps(calibration)), copy.deepcopy(calibration)):
+        assert_allclose(other.pixel_to_sky(999.5, 499.5), (11.0, 21.0))
+        assert_allclose(other.sky_to_pixel(11.0, 21.0), (999.5, 499.5))
 
 
 def test_undistorted_pixels_are_those_of_the_linear_wcs(with_table):

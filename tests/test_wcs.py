@@ -17,7 +17,7 @@ from astropy.wcs.wcsapi import HighLevelWCSWrapper, SlicedLowLevelWCS
 from gwcs import coordinate_frames as cf
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from wpdc_gwcs.models import (
     DetectorToSky,
@@ -162,6 +162,45 @@ def test_one_pass_follows_the_pointing(rng):
     for crval in ((120.001, 30.0), (359.99, -2.0)):
         wcs.pipeline[1].transform.crval = crval
         assert_allclose(wcs(x, y), camera_wcs(crval)(x, y), rtol=0, atol=1e-12)
+
+
+def test_both_ways_follow_every_change(rng):
+    # Whatever way a number is changed in, a second call must not answer as the first one.
+    x, y = detector_points(rng, n=100)
+    wcs = camera_wcs()
+    distortion, sky = (step.transform for step in wcs.pipeline[:-1])
+
+    def set_in_place():
+        distortion.lookup_table.displacement.value[0] += 0.5
+
+    changes = [
+        lambda: setattr(distortion, "crpix", CRPIX + np.array([3.0, 4.0])),
+        lambda: setattr(distortion.pv, "pv1_0", 1e-4),
+        lambda: setattr(distortion.pv.pv2_4, "value", 1e-3),
+        lambda: setattr(sky, "cd", 1.001 * sky.cd.value),
+        lambda: setattr(wcs, "bounding_box", ((-0.5, 400.0), (-0.5, 300.0))),
+        set_in_place,
+    ]
+    position = wcs(x, y)
+    found = wcs.invert(*position)
+    for change in changes:
+        change()
+        fresh = wcs.forward_transform
+        box = wcs.bounding_box.bounding_box(order="F")
+        new_position, new_found = wcs(x, y), wcs.invert(*position)
+        assert not np.array_equal(new_position, position, equal_nan=True)
+        assert not np.array_equal(new_found, found, equal_nan=True)
+        inside = ~np.isnan(new_position[0])
+        assert_array_equal(inside, (x <= box[0][1]) & (y <= box[1][1]))
+        assert_allclose(
+            np.array(new_position)[:, inside],
+            np.array(sky(*distortion(x, y)))[:, inside],
+            rtol=0,
+            atol=1e-10,
+        )
+        assert_allclose(wcs.invert(*fresh(x, y)), np.where(inside, (x, y), np.nan), atol=1e-6)
+        found = new_found
+        position = fresh(x, y)
 
 
 def test_polynomial_alone_is_a_tpv_header(rng):
@@ -444,6 +483,8 @@ def test_quantities():
     assert_allclose((ra.value, dec.value), wcs(10, 20))
     x, y = wcs.invert(ra, dec)
     assert_allclose((x.to_value(u.pix), y.to_value(u.pix)), (10, 20), atol=1e-8)
+    outside = wcs.invert(0 * u.deg, 0 * u.deg, fill_value=-1.0)
+    assert outside == (-1 * u.pix, -1 * u.pix)
 
 
 def test_slicing_and_footprint():

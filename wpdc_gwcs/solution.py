@@ -11,11 +11,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from astropy import units as u
 from scipy.interpolate import RegularGridInterpolator
 
 from wpdc_gwcs.export.memory import InMemory
 from wpdc_gwcs.frozen import freeze_attributes, frozen_array
 from wpdc_gwcs.models import LookupTable, PVPolynomial, deproject
+from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.wcs import build_wcs
 
 __all__ = ["Calibration", "DistortionSolution"]
@@ -222,6 +224,15 @@ def covariance_of(sigma):
     return np.array([[sigma_x**2, cross], [cross, sigma_y**2]])
 
 
+def _evaluate(function, first, second, unit):
+    """Evaluate a function of blocks for numbers or Quantities; scalars become floats."""
+    values = [v.to_value(unit) if isinstance(v, u.Quantity) else v for v in (first, second)]
+    first, second = evaluate_blocks(function, *values)
+    if first.ndim or hasattr(first, "mask"):
+        return first, second
+    return first.item(), second.item()
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration(InMemory):
     """One calibrated frame: an instrument and the attitude of one exposure.
@@ -272,9 +283,16 @@ class Calibration(InMemory):
         frozen_array(self, "color_shift", shape=(2, 3))
         freeze_attributes(self, "statistics", "settings", "provenance")
 
+    def __getstate__(self):
+        # Functions of compiled code stay where they are; they are made again where they are needed.
+        return {name: value for name, value in self.__dict__.items() if name != "_functions"}
+
     @cached_property
     def wcs(self):
         """WCS of the frame, `gwcs.WCS`."""
+        return self._build_wcs()
+
+    def _build_wcs(self):
         s = self.solution
         return build_wcs(
             crpix=s.crpix,
@@ -285,6 +303,54 @@ class Calibration(InMemory):
             lookup_table=self.lookup_table,
             image_shape=s.image_shape,
         )
+
+    @cached_property
+    def _functions(self):
+        """Both ways between detector and sky, as functions of blocks of points."""
+        # Not those of the WCS, which can be changed: these need not look whether it was.
+        wcs = self._build_wcs()
+        box = wcs.bounding_box
+        box = None if box is None else box.bounding_box(order="F")
+        forward = wcs.forward_transform
+        return forward.block_function(box=box), forward.inverse.block_function(box=box)
+
+    def pixel_to_sky(self, x, y):
+        """Map detector pixels to the sky: ``wcs(x, y)`` without what every call of it must check.
+
+        Parameters
+        ----------
+        x, y : array_like or `~astropy.units.Quantity`
+            Detector pixels, zero based; of any shapes that fit each other.
+
+        Returns
+        -------
+        ra, dec : float or ndarray
+            Positions in degrees, NaN off the detector; masked where an input is.
+
+        See Also
+        --------
+        sky_to_pixel : The way back.
+        """
+        return _evaluate(self._functions[0], x, y, u.pix)
+
+    def sky_to_pixel(self, ra, dec):
+        """Map the sky to detector pixels: ``wcs.invert(ra, dec)`` without its checks.
+
+        Parameters
+        ----------
+        ra, dec : array_like or `~astropy.units.Quantity`
+            Positions in degrees, or with a unit of their own.
+
+        Returns
+        -------
+        x, y : float or ndarray
+            Detector pixels, zero based, NaN off the detector; masked where an input is.
+
+        See Also
+        --------
+        pixel_to_sky : The way to the sky.
+        """
+        return _evaluate(self._functions[1], ra, dec, u.deg)
 
     @cached_property
     def lookup_table(self):

@@ -12,6 +12,7 @@ import pickle
 import numpy as np
 from astropy import coordinates as coord
 from astropy import units as u
+from astropy.modeling.bounding_box import ModelBoundingBox
 from astropy.modeling.models import (
     AffineTransformation2D,
     Const2D,
@@ -34,13 +35,10 @@ from scipy.interpolate import make_interp_spline
 
 from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, TangentSky
 from wpdc_gwcs.models.blocks import evaluate_blocks, run_blocks
-from wpdc_gwcs.models.mapping import PlaneMap
+from wpdc_gwcs.models.mapping import RIM_PX, PlaneMap
 from wpdc_gwcs.models.powers import fit_polynomial
 
 __all__ = ["DetectorWCS", "build_wcs", "sky_map", "to_stock_wcs"]
-
-# An answer this far (px) outside the bounding box lies on its rim but for rounding.
-_RIM_PX = 1e-6
 
 
 class DetectorWCS(WCS):
@@ -58,17 +56,37 @@ class DetectorWCS(WCS):
     All else, including the parameters, is that of the base class.
     """
 
+    def _models(self):
+        """Return both models if they are those of `build_wcs`, else `None`."""
+        steps = self.pipeline
+        if len(steps) != 3:
+            return None
+        models = steps[0].transform, steps[1].transform
+        if type(models[0]) is DistortionCorrection and type(models[1]) is TangentSky:
+            return models
+        return None
+
     @property
     def forward_transform(self):
         """The transform from the first to the last frame, with the bounding box."""
-        transforms = [step.transform for step in self.pipeline[:-1]]
-        if list(map(type, transforms)) != [DistortionCorrection, TangentSky]:
+        models = self._models()
+        if models is None:
             return super().forward_transform
-        fused = DetectorToSky(*transforms)
+        fused = DetectorToSky(*models)
         box = self.bounding_box
         if box is not None:
             fused.bounding_box = box
         return fused
+
+    def _limits(self, distortion):
+        """Return least and greatest x, least and greatest y, `None` without a bounding box."""
+        try:
+            box = distortion.bounding_box
+        except NotImplementedError:
+            return None
+        if isinstance(box, ModelBoundingBox) and len(box.intervals) == 2:
+            return box.intervals[0], box.intervals[1]
+        return box.bounding_box(order="F")
 
     def __call__(self, *args, with_bounding_box=True, fill_value=np.nan, **kwargs):
         """Map detector pixels to the last frame.
@@ -89,22 +107,44 @@ class DetectorWCS(WCS):
         result : tuple of array_like
             Coordinates in the last frame.
         """
-        transform = self.forward_transform
-        if kwargs or len(args) != 2 or not isinstance(transform, DetectorToSky):
+        models = self._models()
+        if models is None or kwargs or len(args) != 2:
             return super().__call__(
                 *args, with_bounding_box=with_bounding_box, fill_value=fill_value, **kwargs
             )
-        with_units = any(isinstance(value, u.Quantity) for value in args)
-        if with_units:
-            args = self.input_frame.remove_units(args)
-        box = self.bounding_box if with_bounding_box else None
-        if box is not None:
-            box = box.bounding_box(order="F")
-        result = evaluate_blocks(transform.block_function(box=box, fill_value=fill_value), *args)
-        result = tuple(
-            value if value.ndim or hasattr(value, "mask") else value.item() for value in result
-        )
-        return self.output_frame.add_units(result) if with_units else result
+        distortion, sky = models
+        box = self._limits(distortion) if with_bounding_box else None
+        function = sky._after(distortion._plane_map()).to_sky(box, fill_value)
+        return _evaluate(function, args, self.input_frame, self.output_frame)
+
+    def invert(self, *args, with_bounding_box=True, fill_value=np.nan, **kwargs):
+        """Map positions in the last frame to detector pixels.
+
+        Parameters
+        ----------
+        *args : array_like
+            Coordinates in the last frame.
+        with_bounding_box : bool, optional
+            Whether points outside the bounding box become ``fill_value``.
+        fill_value : float, optional
+            What both coordinates become, there and where there is no answer.
+        **kwargs
+            Passed on to the base class.
+
+        Returns
+        -------
+        result : tuple of array_like
+            Pixel coordinates, zero based.
+        """
+        models = self._models()
+        if models is None or kwargs or len(args) != 2:
+            return super().invert(
+                *args, with_bounding_box=with_bounding_box, fill_value=fill_value, **kwargs
+            )
+        distortion, sky = models
+        box = self._limits(distortion) if with_bounding_box else None
+        function = sky._after(distortion._plane_map()).from_sky(box, fill_value)
+        return _evaluate(function, args, self.output_frame, self.input_frame)
 
     @property
     def _has_our_inverse(self):
@@ -158,7 +198,7 @@ class DetectorWCS(WCS):
         for k, (low, high) in enumerate(limits):
             # NaN stays NaN, and is outside.
             near = np.clip(values[k], low, high)
-            values[k] = np.where(np.abs(near - values[k]) <= _RIM_PX, near, values[k])
+            values[k] = np.where(np.abs(near - values[k]) <= RIM_PX, near, values[k])
             outside = outside | ~((values[k] >= low) & (values[k] <= high))
         values = [np.where(outside, fill_value, value)[()] for value in values]
         for k, given in enumerate(pixel_arrays):
@@ -167,6 +207,18 @@ class DetectorWCS(WCS):
             elif hasattr(given, "mask"):
                 values[k] = Masked(values[k], mask=given.mask)
         return tuple(values)
+
+
+def _evaluate(function, args, input_frame, output_frame):
+    """Evaluate a function of blocks for arguments with units or without; scalars become floats."""
+    with_units = any(isinstance(value, u.Quantity) for value in args)
+    if with_units:
+        args = input_frame.remove_units(args)
+    result = tuple(
+        value if value.ndim or hasattr(value, "mask") else value.item()
+        for value in evaluate_blocks(function, *args)
+    )
+    return output_frame.add_units(result) if with_units else result
 
 
 def build_wcs(
@@ -359,34 +411,41 @@ def sky_map(wcs, *, image_shape=None, out=None):
         if array.shape != (ny, nx):
             raise ValueError(f"out must hold two arrays of the shape {(ny, nx)}, not {array.shape}")
     transform = wcs.forward_transform
-    columns = np.arange(nx, dtype=float)
-    # Threads take bands of rows, in pieces that stay in the cache.
+    columns, rows = np.arange(nx, dtype=float), np.arange(ny, dtype=float)
+    if isinstance(transform, DetectorToSky):
+        function = transform.row_function(columns, rows)
+    else:
+        function = _any_rows(transform, columns, rows)
+    # Threads take bands of rows.
     band = max(1, _BAND_SIZE // nx)
-    step = max(1, _PIECE_SIZE // nx)
 
     def fill(first, last):
-        if isinstance(transform, DetectorToSky):
-            function = transform.row_function(columns)
-        else:
-            function = _any_rows(transform, columns)
-        with np.errstate(all="ignore"):
-            for start in range(first * band, min(last * band, ny), step):
-                stop = min(start + step, last * band, ny)
-                values = function(np.arange(start, stop, dtype=float))
+        for start in range(first * band, min(last * band, ny), band):
+            stop = min(start + band, ny)
+            targets = ra[start:stop], dec[start:stop]
+            if all(t.flags.c_contiguous and t.dtype == np.float64 for t in targets):
+                function(start, stop, *targets)
+            else:
+                values = np.empty((2, stop - start, nx))
+                function(start, stop, *values)
                 ra[start:stop], dec[start:stop] = values
 
     run_blocks(fill, math.ceil(ny / band), weight=band * nx)
     return ra, dec
 
 
-# Pixels in a band of rows that a thread takes, and in a piece of it that is worked on at a time.
+# Pixels in a band of rows that a thread takes.
 _BAND_SIZE = 524_288
-_PIECE_SIZE = 65_536
 
 
-def _any_rows(transform, x):
-    """Return a function for whole rows of any transform."""
-    return lambda y: transform(*np.broadcast_arrays(x, y[:, np.newaxis]))
+def _any_rows(transform, x, y):
+    """Return a function for rows of any transform."""
+
+    def function(start, stop, ra, dec):
+        with np.errstate(all="ignore"):
+            ra[...], dec[...] = transform(*np.broadcast_arrays(x, y[start:stop, np.newaxis]))
+
+    return function
 
 
 def to_stock_wcs(wcs):

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import percentile_filter
 
+from wpdc_gwcs import kernels
 from wpdc_gwcs.centroids._profile import cutouts
 
 __all__ = [
@@ -229,26 +230,14 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
 
 def _normal_step(basis, flux, pixels, use, sky, noise):
     """Gauss-Newton step (N, 3), covariance (N, 3, 3) and reduced chi square."""
-    model = flux[:, None] * basis[0]
-    weight = use / noise.variance(sky, model)
-    residual = pixels - model
-    jacobian = np.stack([flux[:, None] * basis[1], flux[:, None] * basis[2], basis[0]], axis=1)
-    weighted = jacobian * weight[:, None]
-    normal = weighted @ jacobian.transpose(0, 2, 1)
-    right = (weighted @ residual[:, :, None])[:, :, 0]
-    # Scaled to a unit diagonal, so that "singular" has one meaning for all fluxes.
-    scale = np.sqrt(np.einsum("sii->si", normal))
-    empty = ~(scale > 0).all(axis=1)
-    scale[empty] = 1
-    scaled = normal / scale[:, :, None] / scale[:, None, :]
-    bad = empty | ~(np.linalg.det(scaled) > 1e-6)
-    scaled[bad] = np.eye(3)
-    covariance = np.linalg.inv(scaled) / scale[:, :, None] / scale[:, None, :]
-    step = (covariance @ right[:, :, None])[:, :, 0]
-    step[bad] = 0
-    covariance[bad] = np.nan
-    freedom = np.maximum(use.sum(axis=1) - 3, 1)
-    return step, covariance, (weight * residual**2).sum(axis=1) / freedom
+    n = len(flux)
+    step, covariance, chi2 = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
+    photons = None if np.isscalar(sky.photons) else np.ascontiguousarray(sky.photons, dtype=float)
+    numbers = np.array([noise.inverse_gain, noise.mismatch])
+    kernels.star_steps(
+        basis, flux, pixels, use, sky.variance, photons, numbers, step, covariance, chi2
+    )
+    return step, covariance, chi2
 
 
 def render(shape, profile, stars, *, faintest=0.0):
@@ -272,7 +261,6 @@ def render(shape, profile, stars, *, faintest=0.0):
     """
     x, y, flux = stars
     image = np.zeros(shape, dtype=np.float32)
-    flat = image.reshape(-1)
     samples = np.abs(profile.samples()).max(axis=0)
     center = samples.shape[0] // 2
     full = profile.radius - 1
@@ -284,19 +272,7 @@ def render(shape, profile, stars, *, faintest=0.0):
     group = (flux[:, None] * level > faintest).sum(axis=1)
     for g, half in enumerate(sizes):
         rows = np.flatnonzero(group == g)
-        size = max(1, _CHUNK * 100 // (2 * half + 1) ** 2)
-        for start in range(0, len(rows), size):
-            k = rows[start : start + size]
-            xc, yc = np.rint(x[k]).astype(int), np.rint(y[k]).astype(int)
-            shares = profile.shares(x[k], y[k])
-            model = profile.evaluate(x[k] - xc, y[k] - yc, half, shares, gradient=False)[0]
-            step = np.arange(-half, half + 1)
-            iy, ix = yc[:, None] + step, xc[:, None] + step
-            inside = ((iy >= 0) & (iy < shape[0]))[:, :, None]
-            inside = (inside & ((ix >= 0) & (ix < shape[1]))[:, None, :]).reshape(model.shape)
-            index = (iy[:, :, None] * shape[1] + ix[:, None, :]).reshape(model.shape)
-            value = (flux[k, None] * model).astype(np.float32)
-            np.add.at(flat, index[inside], value[inside])
+        profile.paint(image, x[rows], y[rows], flux[rows], half)
     return image
 
 

@@ -35,6 +35,9 @@ __all__ = ["StarNoise", "build_epsf", "fit_centroids", "measure_noise", "subtrac
 
 log = logging.getLogger(__name__)
 
+# Pixels of an image that are worked on at a time.
+_STRIP = 500_000
+
 # Stars whose residuals tell the error of the PSF.
 _MAX_STARS = 1000
 _MIN_STARS = 8
@@ -305,11 +308,20 @@ def subtract_stars(background, sources, epsf, *, gain=None):
     drawn = np.isfinite(np.asarray(sources["chi2"], dtype=float))
     stars = _stars_of(sources, background.unit).take(drawn)
     model = render(background.image.shape, profile, stars)
-    variance = background.rms.astype(np.float32) ** 2 + (_MODEL_ERROR * model) ** 2
-    if gain is not None:
-        photons = np.maximum(model, 0) / (gain * background.unit)
-        variance += photons if background.photons is None else photons * background.photons
-    return replace(background, image=background.image - model, rms=np.sqrt(variance))
+    rms = np.empty(model.shape, dtype=np.float32)
+    # In strips: work space for whole images takes longer to be had than the work itself.
+    step = max(1, _STRIP // model.shape[1])
+    for start in range(0, len(model), step):
+        rows = slice(start, start + step)
+        variance = background.rms[rows].astype(np.float32) ** 2 + (_MODEL_ERROR * model[rows]) ** 2
+        if gain is not None:
+            photons = np.maximum(model[rows], 0) / (gain * background.unit)
+            if background.photons is not None:
+                photons = photons * background.photons[rows]
+            variance += photons
+        np.sqrt(variance, out=rms[rows])
+        np.subtract(background.image[rows], model[rows], out=model[rows])
+    return replace(background, image=model, rms=rms)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import spline_filter, uniform_filter1d
 
+from wpdc_gwcs import kernels
+
 __all__ = ["Profile", "cutouts", "moffat_samples", "spline_coefficients", "spline_taps"]
 
 
@@ -110,33 +112,35 @@ class Profile:
         (3, N, n) or (1, N, n) ndarray
             Value and, if asked for, derivatives by x and y, in n = (2 half + 1)^2 pixels.
         """
-        base_x, taps_x, slopes_x = spline_taps(self._center - self.oversampling * dx)
-        base_y, taps_y, slopes_y = spline_taps(self._center - self.oversampling * dy)
-        outer = [taps_y[:, :, None] * taps_x[:, None, :]]
-        if gradient:
-            outer.append(-self.oversampling * taps_y[:, :, None] * slopes_x[:, None, :])
-            outer.append(-self.oversampling * slopes_y[:, :, None] * taps_x[:, None, :])
-        outer = np.stack(outer).reshape(len(outer), len(dx), 1, 16) * shares[:, :, None]
-        outer = outer.reshape(len(outer), len(dx), 16 * shares.shape[1])
-        result = np.empty((len(outer), len(dx), (2 * half + 1) ** 2))
-        grids = self._components[0]
-        margin = self.oversampling * (2 * half + 2) + 8
-        padded = np.pad(grids, ((0, 0), (margin, margin), (margin, margin)))
-        # Stars that ran far away see nothing but the padding.
-        limit = margin - self.oversampling * half - 4
-        lowest, highest = -limit, grids.shape[-1] + limit
-        base_x, base_y = np.clip(base_x, lowest, highest), np.clip(base_y, lowest, highest)
-        cell = base_y * 10_000 + base_x
-        order = np.argsort(cell, kind="stable")
-        starts = np.flatnonzero(np.diff(cell[order], prepend=cell[order[:1]] - 1))
-        step = margin + self.oversampling * np.arange(-half, half + 1)
-        tap = np.arange(-1, 3)[:, None]
-        for rows in np.split(order, starts[1:]) if len(order) else ():
-            iy = base_y[rows[0]] + tap + step
-            ix = base_x[rows[0]] + tap + step
-            table = padded[:, iy[:, None, :, None], ix[None, :, None, :]]
-            result[:, rows] = outer[:, rows] @ table.reshape(outer.shape[-1], -1)
+        result = np.empty((3 if gradient else 1, len(dx), (2 * half + 1) ** 2))
+        kernels.star_profiles(*self._numbers(dx, dy, shares), half, result)
         return result
+
+    def paint(self, image, x, y, flux, half):
+        """Add stars to an image.
+
+        Parameters
+        ----------
+        image : (ny, nx) float32 ndarray
+            The image.
+        x, y, flux : (N,) ndarray
+            Positions in px, and fluxes.
+        half : int
+            Stars are 2 half + 1 px wide.
+        """
+        center = np.rint(np.column_stack([x, y]))
+        numbers = self._numbers(x - center[:, 0], y - center[:, 1], self.shares(x, y))
+        flux = np.ascontiguousarray(flux, dtype=float)
+        kernels.paint_stars(*numbers, half, center, flux, image)
+
+    def _numbers(self, dx, dy, shares):
+        """Grids, oversampling, phases and shares as kernels take them."""
+        taps = [spline_taps(self._center - self.oversampling * d) for d in (dx, dy)]
+        phase = np.column_stack([column for columns in taps for column in columns])
+        grids, shares = (
+            np.ascontiguousarray(values, dtype=float) for values in (self._components[0], shares)
+        )
+        return grids, self.oversampling, phase, shares
 
     @property
     def _center(self):

@@ -39,9 +39,9 @@ _INTERRUPTED = 130
 
 def _show_version(value: bool):
     if value:
-        from wpdc_gwcs import __version__
+        from wpdc_gwcs import __version__, kernels
 
-        typer.echo(f"wpdc_gwcs {__version__}")
+        typer.echo(f"wpdc_gwcs {__version__} ({kernels.implementation} kernels)")
         raise typer.Exit
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from wpdc_gwcs.exceptions import FrameError, WPDCWarning
-from wpdc_gwcs.io.files import READ_ERRORS, first_line, open_fits, split_extension, stem_of
+from wpdc_gwcs.io.files import open_fits, split_extension, stem_of
 from wpdc_gwcs.io.headers import find_extension, header_text
 from wpdc_gwcs.io.images import pixels_of
 from wpdc_gwcs.robust import robust_scatter

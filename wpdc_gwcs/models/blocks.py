@@ -82,12 +82,12 @@ def run_blocks(function, size, *, weight=1):
 
 
 def evaluate_blocks(function, *inputs, n_outputs=2):
-    """Evaluate ``function(*blocks) -> outputs`` over inputs of any shape, block by block.
+    """Call ``function(*inputs, *outputs)`` for inputs of any shape, block by block.
 
     Parameters
     ----------
     function : callable
-        Takes contiguous 1-D float64 arrays and returns ``n_outputs`` arrays of the same length.
+        Takes contiguous 1-D float64 arrays and writes as many outputs of the same length.
     *inputs : array_like
         Mutually broadcastable; scalars, empty and multi-dimensional arrays are welcome.  What is
         masked in one of them is masked in all outputs.
@@ -100,6 +100,11 @@ def evaluate_blocks(function, *inputs, n_outputs=2):
         Of the broadcast shape of the inputs (zero-dimensional for scalars).  Masked arrays, of
         numpy or of astropy, if an input is one.
     """
+    if all(isinstance(value, (float, int)) for value in inputs):
+        # One point, as in a loop over objects: without all that follows.
+        outputs = [np.empty(1) for _ in range(n_outputs)]
+        function(*[np.array((value,), dtype=np.float64) for value in inputs], *outputs)
+        return tuple([output.reshape(()) for output in outputs])
     if any(hasattr(value, "mask") for value in inputs):
         return _evaluate_masked(function, inputs, n_outputs)
     inputs = [np.asarray(value) for value in inputs]
@@ -107,24 +112,18 @@ def evaluate_blocks(function, *inputs, n_outputs=2):
         inputs = np.broadcast_arrays(*inputs)
     shape = inputs[0].shape
     flat = [value.reshape(-1) for value in inputs]
-    size = flat[0].size
-
-    def call(start, stop):
-        blocks = [np.ascontiguousarray(value[start:stop], dtype=np.float64) for value in flat]
-        # Infinite and absurd coordinates become NaN; that is the answer, not an accident.
-        with np.errstate(all="ignore"):
-            return function(*blocks)
-
-    if size <= BLOCK_SIZE:
-        return tuple(value.reshape(shape) for value in call(0, size))
-    outputs = [np.empty(size) for _ in range(n_outputs)]
+    outputs = [np.empty(shape) for _ in range(n_outputs)]
+    flat_outputs = [output.reshape(-1) for output in outputs]
 
     def run(start, stop):
-        for output, block in zip(outputs, call(start, stop), strict=True):
-            output[start:stop] = block
+        blocks = [np.ascontiguousarray(value[start:stop], dtype=np.float64) for value in flat]
+        function(*blocks, *(output[start:stop] for output in flat_outputs))
 
-    run_blocks(run, size)
-    return tuple(output.reshape(shape) for output in outputs)
+    if flat[0].size <= BLOCK_SIZE:
+        run(0, flat[0].size)
+    else:
+        run_blocks(run, flat[0].size)
+    return tuple(outputs)
 
 
 def _evaluate_masked(function, inputs, n_outputs):

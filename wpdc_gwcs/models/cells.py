@@ -1,67 +1,13 @@
 """Piecewise bicubic maps on a grid of equal cells, summed up by cell."""
 
 import math
-import threading
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from wpdc_gwcs import kernels
+
 __all__ = ["CellGrid", "spline_cells"]
-
-
-def _horner_columns(columns, s, total, slope=None):
-    """Write the sum of ``columns[..., p] s**p``, and its derivative by s when asked for."""
-    n = columns.shape[-1]
-    np.multiply(columns[..., n - 1], s, out=total)
-    total += columns[..., n - 2]
-    if slope is not None:
-        slope[:] = columns[..., n - 1]
-    for p in range(n - 3, -1, -1):
-        if slope is not None:
-            slope *= s
-            slope += total
-        total *= s
-        total += columns[..., p]
-
-
-# Points whose coefficients are worked on at a time, a compromise: fewer stay closer to the core,
-# more keep threads from waiting for each other.
-_PART_SIZE = 16384
-
-
-def _parts(n):
-    return (slice(start, min(start + _PART_SIZE, n)) for start in range(0, n, _PART_SIZE))
-
-
-class _Scratch(threading.local):
-    """Work space that each thread keeps from block to block.
-
-    Arrays of this size would otherwise be mapped and unmapped by the system for every block, which
-    takes longer than filling them.
-    """
-
-    space = np.empty(0)
-
-    def get(self, shape):
-        size = math.prod(shape)
-        if len(self.space) < size:
-            self.space = np.empty(size)
-        return self.space[:size].reshape(shape)
-
-
-_scratch = _Scratch()
-
-
-def _locate(x, low, step, n):
-    s = x - low
-    s *= 1.0 / step
-    i = np.floor(s)
-    # The ring of outer cells takes what is beyond, NaN stays NaN in s.
-    np.maximum(i, -1.0, out=i)
-    np.minimum(i, n, out=i)
-    s -= i
-    i += 1.0
-    return i, s
 
 
 def _with_outer_cells(coefficients, power_axis, cell_axis):
@@ -85,7 +31,8 @@ class CellGrid:
         outer | cells of the grid, numbered from 1 | outer
         s < 1 |          0 <= s < 1                | 0 <= s
 
-    Around them is a ring of outer cells without end, so that there are values everywhere.
+    Around them is a ring of outer cells without end, so that there are values everywhere.  Cells
+    are evaluated by `wpdc_gwcs.kernels`.
 
     Parameters
     ----------
@@ -93,7 +40,7 @@ class CellGrid:
         First and last edge, of the cells without the ring.
     coefficients : (2, n, n, ny + 2, nx + 2) ndarray
         ``coefficients[k, p, q, j, i]`` multiplies ``s**p t**q`` in output k in cell (j, i), the
-        ring of outer cells included.
+        ring of outer cells included; n is 2 or 4.
     smooth : bool, keyword-only
         Whether the first derivatives are continuous from cell to cell.
     """
@@ -106,9 +53,12 @@ class CellGrid:
         self.x_step = (self.x_high - self.x_low) / self.nx
         self.y_step = (self.y_high - self.y_low) / self.ny
         n = coefficients.shape[1]
-        # rows[q, k, cell, p]: the four powers of s side by side, since fetching them 32 bytes at a
-        # time is what costs least, and both outputs in one array, for half as many calls.
-        self.rows = np.ascontiguousarray(coefficients.reshape(2, n, n, -1).transpose(2, 0, 3, 1))
+        if n < 4:
+            wide = np.zeros((2, 4, 4, *coefficients.shape[3:]))
+            wide[:, :n, :n] = coefficients
+            coefficients = wide
+        #: The coefficients in the order that the kernels have them in.
+        self.table = kernels.arrange(coefficients, kernels.CELL_ORDER)
 
     @classmethod
     def continued(cls, x_range, y_range, coefficients, *, smooth):
@@ -141,165 +91,23 @@ class CellGrid:
         """First and last edge along y."""
         return self.y_low, self.y_high
 
-    def clip(self, x, y, margin=0.0):
-        """Move points outside the grid onto its rim, or onto a margin around it, in place.
-
-        Parameters
-        ----------
-        x, y : (N,) ndarray
-            Positions on the grid.
-        margin : float, optional
-            Distance by which points may lie outside.
-        """
-        np.maximum(x, self.x_low - margin, out=x)
-        np.minimum(x, self.x_high + margin, out=x)
-        np.maximum(y, self.y_low - margin, out=y)
-        np.minimum(y, self.y_high + margin, out=y)
-
     @property
     def coefficients(self):
-        """The coefficients the grid was made of, ``[k, p, q, j, i]``, with the outer cells."""
-        n = len(self.rows)
-        return self.rows.transpose(1, 3, 0, 2).reshape(2, n, n, self.ny + 2, self.nx + 2)
+        """The coefficients, ``[k, p, q, j, i]`` with four powers each, with the outer cells."""
+        return kernels.arranged(self.table, kernels.CELL_ORDER)
 
-    def locate_x(self, x):
-        """Return numbers along x, from 0 for the outer cell, and local coordinates.
-
-        Parameters
-        ----------
-        x : (N,) ndarray
-            Positions.
-        """
-        return _locate(x, self.x_low, self.x_step, self.nx)
-
-    def locate_y(self, y):
-        """Return numbers along y, from 0 for the outer cell, and local coordinates.
+    def covers(self, x, y):
+        """Tell whether all points lie inside the cells.
 
         Parameters
         ----------
-        y : (N,) ndarray
-            Positions.
+        x, y : (N,), (M,) ndarray
+            Positions along both axes.
         """
-        return _locate(y, self.y_low, self.y_step, self.ny)
-
-    def number(self, j, i):
-        """Return the number of a cell from its numbers along both axes.
-
-        Parameters
-        ----------
-        j, i : (N,) ndarray
-            Numbers along y and x, as floats; they are overwritten.
-        """
-        j *= self.nx + 2
-        j += i
-        return j.astype(np.intp)
-
-    def locate(self, x, y):
-        """Return cell numbers and local coordinates.
-
-        Parameters
-        ----------
-        x, y : (N,) ndarray
-            Positions.
-        """
-        i, s = self.locate_x(x)
-        j, t = self.locate_y(y)
-        return self.number(j, i), s, t
-
-    def outside(self, x, y):
-        """Tell which points are outside the cells; `None` when none is.
-
-        Parameters
-        ----------
-        x, y : (N,) ndarray
-            Positions; NaN is outside.
-        """
-        if not len(x) or (
-            x.min() >= self.x_low
-            and x.max() <= self.x_high
-            and y.min() >= self.y_low
-            and y.max() <= self.y_high
-        ):
-            return None
-        inside = (x >= self.x_low) & (x <= self.x_high)
-        inside &= (y >= self.y_low) & (y <= self.y_high)
-        return ~inside
-
-    def evaluate(self, cell, s, t):
-        """Return both outputs.
-
-        Parameters
-        ----------
-        cell : (N,) ndarray of int
-            Cell numbers, see `locate`.
-        s, t : (N,) ndarray
-            Local coordinates in the cells.
-        """
-        outputs = np.empty((2, len(s)))
-        *lower, highest = self.rows
-        for part in _parts(len(s)):
-            (total, term), wide_t = self._work_space(t[part], 2)
-            highest.take(cell[part], axis=1, out=total, mode="clip")
-            for row in reversed(lower):
-                total *= wide_t
-                row.take(cell[part], axis=1, out=term, mode="clip")
-                total += term
-            _horner_columns(total, s[part], outputs[:, part])
-        return outputs
-
-    def _work_space(self, t, n_arrays):
-        """Return arrays ``[output, point, power of s]``, and t repeated for all powers of s."""
-        n = len(self.rows)
-        space = _scratch.get((2 * n_arrays + 1, len(t), n))
-        wide_t = space[-1]
-        for column in wide_t.T:
-            column[:] = t
-        return space[:-1].reshape(n_arrays, 2, len(t), n), wide_t
-
-    def collapse(self, cell, s):
-        """Return the coefficients ``[k][q]`` of the powers of t that are left when s is given.
-
-        Parameters
-        ----------
-        cell : (N,) ndarray of int
-            Cell numbers, see `locate`.
-        s : (N,) ndarray
-            Local coordinates in the cells.
-        """
-        coefficients = np.empty((2, len(self.rows), len(s)))
-        for q, row in enumerate(self.rows):
-            _horner_columns(row.take(cell, axis=1), s, coefficients[:, q])
-        return coefficients
-
-    def evaluate_jacobian(self, cell, s, t):
-        """Return both outputs and their derivatives, ``(a, b), (a_x, a_y, b_x, b_y)``.
-
-        Parameters
-        ----------
-        cell : (N,) ndarray of int
-            Cell numbers, see `locate`.
-        s, t : (N,) ndarray
-            Local coordinates in the cells.
-        """
-        values, by_s, by_t = np.empty((3, 2, len(s)))
-        *lower, highest = self.rows
-        for part in _parts(len(s)):
-            (total, slope, term), wide_t = self._work_space(t[part], 3)
-            highest.take(cell[part], axis=1, out=total, mode="clip")
-            for step, row in enumerate(reversed(lower)):
-                if step == 0:
-                    slope[:] = total
-                else:
-                    slope *= wide_t
-                    slope += total
-                total *= wide_t
-                row.take(cell[part], axis=1, out=term, mode="clip")
-                total += term
-            _horner_columns(total, s[part], values[:, part], by_s[:, part])
-            _horner_columns(slope, s[part], by_t[:, part])
-        by_s *= 1.0 / self.x_step
-        by_t *= 1.0 / self.y_step
-        return values, (by_s[0], by_t[0], by_s[1], by_t[1])
+        return all(
+            values.size == 0 or (values.min() >= low and values.max() <= high)
+            for values, (low, high) in ((x, self.x_range), (y, self.y_range))
+        )
 
     def transformed(self, matrix, offset=(0.0, 0.0)):
         """Return the grid with its outputs (a, b) replaced by ``matrix @ (a, b) + offset``.
@@ -311,7 +119,8 @@ class CellGrid:
         offset : (2,) array_like, optional
             Offset.
         """
-        coefficients = np.einsum("ij,j...->i...", matrix, self.coefficients)
+        a, b = self.coefficients
+        coefficients = np.stack([row[0] * a + row[1] * b for row in np.asarray(matrix)])
         coefficients[:, 0, 0] += np.reshape(offset, (2, 1, 1))
         return CellGrid(self.x_range, self.y_range, coefficients, smooth=self.smooth)
 
@@ -366,12 +175,14 @@ class CellGrid:
         """
         if not self.smooth:
             return np.inf
-        n = len(self.rows)
-        p, q = np.arange(n)[:, np.newaxis, np.newaxis, np.newaxis], np.arange(n)[:, None, None]
-        size = np.abs(self.coefficients[..., 1:-1, 1:-1])
-        along_x = (size * p * (p - 1)).sum(axis=(1, 2)).max() / self.x_step**2
-        along_y = (size * q * (q - 1)).sum(axis=(1, 2)).max() / self.y_step**2
-        mixed = (size * p * q).sum(axis=(1, 2)).max() / (self.x_step * self.y_step)
+        p, q = np.arange(4)[:, np.newaxis], np.arange(4)
+        factors = np.broadcast_arrays(
+            p * (p - 1) / self.x_step**2,
+            q * (q - 1) / self.y_step**2,
+            p * q / (self.x_step * self.y_step),
+        )
+        size = np.abs(self.coefficients[..., 1:-1, 1:-1]).reshape(2, 16, -1)
+        along_x, along_y, mixed = (np.reshape(factors, (3, 16)) @ size).max(axis=(0, 2))
         return max(along_x, along_y) + mixed
 
     def fold(self, polynomial, origin):
@@ -402,9 +213,7 @@ class CellGrid:
                     shift[:, a, p] = math.comb(p, a) * edge ** (p - a) * step**a
             shifts.append(shift)
         local = np.einsum("iap,jbq,kpq->kabji", *shifts, polynomial, optimize=True)
-        n = len(self.rows)
-        total = np.zeros((2, 4, 4, self.ny + 2, self.nx + 2))
-        total[:, :n, :n] += self.coefficients
+        total = np.array(self.coefficients)
         total[:, :m, :m] += local
         return CellGrid(self.x_range, self.y_range, total, smooth=self.smooth)
 

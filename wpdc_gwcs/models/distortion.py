@@ -14,15 +14,12 @@ from astropy.modeling import Model, Parameter
 
 from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.models.lookup_table import LookupTable
-from wpdc_gwcs.models.mapping import PlaneMap
+from wpdc_gwcs.models.mapping import TOLERANCE_PX, PlaneMap
 from wpdc_gwcs.models.polynomial import PVPolynomial
 from wpdc_gwcs.models.powers import expand_pv
 from wpdc_gwcs.models.tangent import check_invertible
 
 __all__ = ["DetectorToSky", "DistortionCorrection", "DistortionInverse", "SkyToDetector"]
-
-# Residual of the inverse in undistorted pixels; Newton's last step leaves far less.
-_TOLERANCE_PX = 1e-9
 
 
 class DistortionCorrection(Model):
@@ -146,13 +143,12 @@ class DistortionCorrection(Model):
         """Return the map on blocks, kept until a parameter, the polynomial or the table changes."""
         if crpix is None:
             crpix, cd = self.crpix.value, self.cd.value
-        pv = self._pv
-        numbers = np.concatenate([np.ravel(crpix), np.ravel(cd), pv.parameters])
         cells = None if self._lookup_table is None else self._lookup_table._cells()
+        key = (crpix.tobytes(), cd.tobytes(), self._pv._values())
         cache = self._cache
-        if cache is not None and cache[1] is cells and np.array_equal(cache[0], numbers):
+        if cache is not None and cache[1] is cells and cache[0] == key:
             return cache[2]
-        crpix, cd = numbers[:2], numbers[2:6].reshape(2, 2)
+        crpix, cd = np.reshape(crpix, 2), np.reshape(cd, (2, 2))
         polynomial, radial = self._expand(crpix, cd)
         plane_map = PlaneMap(
             polynomial,
@@ -161,7 +157,7 @@ class DistortionCorrection(Model):
             radial_matrix=cd,
             grid=None if cells is None else cells.transformed(-np.eye(2)),
         )
-        self._cache = (numbers, cells, plane_map)
+        self._cache = (key, cells, plane_map)
         return plane_map
 
     def _expand(self, crpix, cd):
@@ -200,7 +196,7 @@ class DistortionCorrection(Model):
         x, y : ndarray
             Undistorted pixel coordinates, zero based.
         """
-        return evaluate_blocks(self._plane_map(crpix, cd), x, y)
+        return evaluate_blocks(self._plane_map(crpix, cd).evaluate, x, y)
 
     def jacobian(self, x, y):
         """Return the derivatives of both outputs by both inputs.
@@ -215,8 +211,7 @@ class DistortionCorrection(Model):
         jacobian : (2, 2, ...) ndarray
             ``jacobian[i, j]`` is the derivative of output i by input j.
         """
-        plane_map = self._plane_map()
-        rows = evaluate_blocks(lambda a, b: plane_map.jacobian(a, b)[1], x, y, n_outputs=4)
+        rows = evaluate_blocks(self._plane_map().jacobian, x, y, n_outputs=6)[2:]
         return np.array(rows).reshape(2, 2, *rows[0].shape)
 
     @property
@@ -252,14 +247,6 @@ class DistortionInverse(Model):
         self.inputs = ("x_undistorted", "y_undistorted")
         self.outputs = ("x", "y")
 
-    def _block_function(self):
-        plane_map = self.distortion._plane_map()
-
-        def invert(x, y):
-            return plane_map.invert(x, y, tolerance=_TOLERANCE_PX)
-
-        return invert
-
     def evaluate(self, x, y):
         """Put the distortion back.
 
@@ -273,7 +260,8 @@ class DistortionInverse(Model):
         x, y : ndarray
             Detector pixel coordinates, zero based; NaN where there is no answer.
         """
-        return evaluate_blocks(self._block_function(), x, y)
+        invert = self.distortion._plane_map().inverse(tolerance=TOLERANCE_PX)
+        return evaluate_blocks(invert, x, y)
 
     @property
     def inverse(self):
@@ -343,46 +331,25 @@ class DetectorToSky(Model):
         Returns
         -------
         function : callable
-            ``function(x, y) -> ra, dec``.
+            ``function(x, y, ra, dec)`` writes positions in degrees.
         """
-        to_sky = self.sky._after(self.distortion._plane_map())
-        if box is None:
-            return to_sky
-        (x_low, x_high), (y_low, y_high) = box
-        grid = to_sky.to_plane.grid
-        if grid is not None:
-            edges = (grid.x_range, grid.y_range)
-            if all(e[0] <= b[0] and e[1] >= b[1] for e, b in zip(edges, box, strict=True)):
-                # What is outside the grid is filled anyway.
-                to_sky = to_sky.inside
+        return self.sky._after(self.distortion._plane_map()).to_sky(box, fill_value)
 
-        def function(x, y):
-            ra, dec = to_sky(x, y)
-            # Written so that NaN counts as outside.
-            if len(x) and not (
-                x.min() >= x_low and x.max() <= x_high and y.min() >= y_low and y.max() <= y_high
-            ):
-                outside = ~((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high))
-                ra[outside] = fill_value
-                dec[outside] = fill_value
-            return ra, dec
-
-        return function
-
-    def row_function(self, x):
+    def row_function(self, x, y):
         """Return the map as a function of whole rows of an image.
 
         Parameters
         ----------
-        x : (N,) ndarray
-            Positions along a row.
+        x, y : (N,), (M,) ndarray
+            Columns and rows.
 
         Returns
         -------
         function : callable
-            ``function(y) -> ra, dec`` for M rows, each (M, N).
+            ``function(start, stop, ra, dec)`` writes the positions of some of the rows in degrees,
+            each (stop - start, N).
         """
-        return self.sky._after(self.distortion._plane_map()).along_rows(x)
+        return self.sky._after(self.distortion._plane_map()).row_function(x, y)
 
     @property
     def inverse(self):
@@ -427,10 +394,25 @@ class SkyToDetector(Model):
         x, y : ndarray
             Detector pixel coordinates, zero based; NaN where there is no answer.
         """
-        sky = self.sky.inverse
-        to_pixels = sky._block_function(sky.crpix.value, sky.cd.value, sky.crval.value)
-        invert = DistortionInverse(self.distortion)._block_function()
-        return evaluate_blocks(lambda a, b: invert(*to_pixels(a, b)), ra, dec)
+        return evaluate_blocks(self.block_function(), ra, dec)
+
+    def block_function(self, *, box=None, fill_value=np.nan):
+        """Return the map as a function of contiguous 1-D float64 arrays, without model overhead.
+
+        Parameters
+        ----------
+        box : ((float, float), (float, float)), optional
+            Least and greatest x, least and greatest y.  Answers within 1e-6 px outside are put on
+            its rim.
+        fill_value : float, optional
+            What both coordinates of points outside the box become, and those without an answer.
+
+        Returns
+        -------
+        function : callable
+            ``function(ra, dec, x, y)`` writes pixels.
+        """
+        return self.sky._after(self.distortion._plane_map()).from_sky(box, fill_value)
 
     @property
     def inverse(self):

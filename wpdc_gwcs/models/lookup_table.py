@@ -182,7 +182,7 @@ class LookupTable(Model):
         dx, dy : ndarray
             Displacements to subtract, in pixels.
         """
-        return evaluate_blocks(PlaneMap(grid=self._cells(displacement)), x, y)
+        return evaluate_blocks(PlaneMap(grid=self._cells(displacement)).evaluate, x, y)
 
     def jacobian(self, x, y):
         """Return the derivatives of both outputs by both inputs.
@@ -198,5 +198,5 @@ class LookupTable(Model):
             ``jacobian[i, j]`` is the derivative of output i by input j.
         """
         plane_map = PlaneMap(grid=self._cells())
-        rows = evaluate_blocks(lambda a, b: plane_map.jacobian(a, b)[1], x, y, n_outputs=4)
+        rows = evaluate_blocks(plane_map.jacobian, x, y, n_outputs=6)[2:]
         return np.array(rows).reshape(2, 2, *rows[0].shape)

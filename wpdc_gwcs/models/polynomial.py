@@ -1,5 +1,7 @@
 """The PV (TPV) polynomial in intermediate world coordinates and its exact inverse."""
 
+from operator import attrgetter
+
 import numpy as np
 from astropy.modeling import FittableModel, Model
 from astropy.modeling.parameters import Parameter
@@ -164,6 +166,10 @@ class PVPolynomial(FittableModel):
         """Coefficients as a (2, n_terms) array in the order of `term_indices` (a copy)."""
         return np.array(self.parameters).reshape(2, -1)
 
+    def _values(self):
+        """Return all coefficients, quickly, to tell whether they are still the same."""
+        return [parameter.value for parameter in attrgetter(*self._param_names)(self)]
+
     def _plane_map(self, coefficients):
         polynomial, radial = expand_pv(coefficients, self._degree, self._radial, np.eye(2))
         return PlaneMap(polynomial, radial=radial)
@@ -184,7 +190,7 @@ class PVPolynomial(FittableModel):
             Corrected coordinates in degrees.
         """
         coefficients = np.array([np.ravel(c)[0] for c in coefficients], dtype=float)
-        return evaluate_blocks(self._plane_map(coefficients.reshape(2, -1)), xi, eta)
+        return evaluate_blocks(self._plane_map(coefficients.reshape(2, -1)).evaluate, xi, eta)
 
     def design_matrix(self, xi, eta):
         """Return the derivatives of both outputs by their coefficients, as columns in FITS order.
@@ -235,7 +241,7 @@ class PVPolynomial(FittableModel):
             ``jacobian[i, j]`` is the derivative of output i by input j.
         """
         plane_map = self._plane_map(self.coefficients)
-        rows = evaluate_blocks(lambda a, b: plane_map.jacobian(a, b)[1], xi, eta, n_outputs=4)
+        rows = evaluate_blocks(plane_map.jacobian, xi, eta, n_outputs=6)[2:]
         return np.array(rows).reshape(2, 2, *rows[0].shape)
 
     @property
@@ -284,11 +290,7 @@ class PVInverse(Model):
             Intermediate world coordinates in degrees.
         """
         plane_map = self.polynomial._plane_map(self.polynomial.coefficients)
-
-        def invert(a, b):
-            return plane_map.invert(a, b, tolerance=_TOLERANCE_DEG)
-
-        return evaluate_blocks(invert, xi, eta)
+        return evaluate_blocks(plane_map.inverse(tolerance=_TOLERANCE_DEG), xi, eta)
 
     @property
     def inverse(self):

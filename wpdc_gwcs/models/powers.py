@@ -1,4 +1,4 @@
-"""Polynomials of the plane in powers of both coordinates: expanded, fitted, summed up."""
+"""Polynomials of the plane in powers of both coordinates: expanded, fitted, differentiated."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from wpdc_gwcs.models.terms import pv_terms
 
-__all__ = ["derivative", "expand_pv", "fit_polynomial", "horner", "shift_origin"]
+__all__ = ["derivative", "expand_pv", "fit_polynomial", "shift_origin"]
 
 
 def _linear_power(coefficients, power):
@@ -114,39 +114,6 @@ def shift_origin(polynomial, origin):
         for center in origin
     ]
     return np.einsum("ap,bq,kpq->kab", *map(np.array, shifts), polynomial)
-
-
-def horner(coefficients, a, b):
-    """Sum up a polynomial of the plane by Horner's rule.
-
-    Parameters
-    ----------
-    coefficients : (n, n) ndarray
-        ``coefficients[p, q]`` multiplies ``a**p b**q``; those with ``p + q >= n`` are not used.
-    a, b : (N,) ndarray
-        Coordinates.
-
-    Returns
-    -------
-    total : (N,) ndarray
-        The sum.
-    """
-    n = len(coefficients)
-    total = None
-    for p in range(n - 1, -1, -1):
-        row = coefficients[p]
-        q = n - 1 - p
-        if q == 0:
-            total = np.full(a.shape, row[0])
-            continue
-        inner = row[q] * b
-        inner += row[q - 1]
-        for k in range(q - 2, -1, -1):
-            inner *= b
-            inner += row[k]
-        total *= a
-        total += inner
-    return total
 
 
 def derivative(coefficients, axis):

@@ -1,99 +1,35 @@
 """The tangent plane: gnomonic projection about a point of the sky, and its model."""
 
+from functools import cached_property
+
 import numpy as np
 from astropy.modeling import Model, Parameter
 
+from wpdc_gwcs import kernels
 from wpdc_gwcs.models.blocks import evaluate_blocks
-from wpdc_gwcs.models.mapping import PlaneMap
+from wpdc_gwcs.models.mapping import TOLERANCE_PX, PlaneMap
 
 __all__ = ["SkyTangent", "TangentSky", "deproject", "local_plane", "project"]
 
 
-class _Tangent:
-    """Gnomonic projection about one point, on contiguous blocks."""
+def _projection(crval, matrix=((1.0, 0.0), (0.0, 1.0)), offset=(0.0, 0.0)):
+    """Return a function that writes pixels of positions on the sky."""
+    tangent = kernels.tangent_numbers(crval, matrix, offset)
+    return lambda ra, dec, x, y: kernels.from_sky(tangent, ra, dec, x, y)
 
-    def __init__(self, crval):
-        self.ra0, self.dec0 = (float(value) for value in crval)
-        self.sin0, self.cos0 = np.sin(np.radians(self.dec0)), np.cos(np.radians(self.dec0))
 
-    def project(self, ra, dec):
-        """Sky in degrees to the plane in degrees, NaN on the far hemisphere."""
-        # Sines and cosines from the tangents of the half angles, which numpy has in vector
-        # instructions; numerators and denominator share the factor (1 + tan_ra^2) (1 + tan_dec^2).
-        tan_ra = ra - self.ra0
-        tan_ra *= np.pi / 360
-        np.tan(tan_ra, out=tan_ra)
-        tan_dec = dec * (np.pi / 360)
-        np.tan(tan_dec, out=tan_dec)
-        square = tan_ra * tan_ra
-        cos_dec = tan_dec * tan_dec
-        np.subtract(1.0, cos_dec, out=cos_dec)
-        xi = 2.0 * tan_ra
-        xi *= cos_dec
-        ahead = 1.0 - square
-        ahead *= cos_dec
-        square += 1.0
-        eta = tan_dec
-        eta *= 2.0
-        eta *= square
-        depth = self.sin0 * eta
-        depth += self.cos0 * ahead
-        eta *= self.cos0
-        ahead *= self.sin0
-        eta -= ahead
-        # The horizon itself is infinitely far away.
-        square *= 1e-12
-        hidden = ~(depth > square)
-        if hidden.any():
-            depth[hidden] = np.nan
-        np.divide(180 / np.pi, depth, out=depth)
-        xi *= depth
-        eta *= depth
-        return xi, eta
+def _deprojection(crval, matrix=((1.0, 0.0), (0.0, 1.0)), origin=(0.0, 0.0)):
+    """Return a function that writes positions on the sky of pixels."""
+    plane = _linear_map(matrix, origin).plane
+    tangent = kernels.tangent_numbers(crval)
+    return lambda x, y, ra, dec: kernels.to_sky(plane, None, tangent, None, x, y, ra, dec)
 
-    def deproject(self, xi, eta):
-        """Plane in degrees to the sky in degrees; right ascension from 0 to 360."""
-        return self.deproject_radians(xi * (np.pi / 180), eta * (np.pi / 180))
 
-    def deproject_radians(self, xi, eta):
-        """Plane in radians, which is overwritten, to the sky in degrees."""
-        ra, dec = self.offsets(xi, eta)
-        ra += self.ra0
-        return self.wrap(ra, dec)
-
-    def offsets(self, xi, eta):
-        """Plane in radians, which is overwritten, to RA from RA0 and Dec in degrees."""
-        # Axes of the tangent plane's point: toward RA0 in the equator's plane, east, and north.
-        ahead = eta * -self.sin0
-        ahead += self.cos0
-        north = eta
-        north *= self.cos0
-        north += self.sin0
-        if xi.size and ahead.min() > 0:
-            # Of one argument it is the faster one.
-            ra = xi / ahead
-            np.arctan(ra, out=ra)
-        else:
-            ra = np.arctan2(xi, ahead)
-        xi *= xi
-        ahead *= ahead
-        xi += ahead
-        np.sqrt(xi, out=xi)
-        # At the pole itself it is the arc tangent of infinity.
-        north /= xi
-        dec = np.arctan(north, out=north)
-        dec *= 180 / np.pi
-        ra *= 180 / np.pi
-        return ra, dec
-
-    @staticmethod
-    def wrap(ra, dec):
-        """Bring right ascensions, which are overwritten, into the range from 0 to 360 degrees."""
-        if ra.size and not (ra.min() >= 0.0 and ra.max() < 360.0):
-            np.mod(ra, 360.0, out=ra)
-            # A tiny negative angle is rounded up to 360 by the modulus.
-            ra[ra == 360.0] = 0.0
-        return ra, dec
+def _linear_map(matrix, origin):
+    """Return the map from pixels to the plane in radians, for a matrix in degrees per pixel."""
+    polynomial = np.zeros((2, 2, 2))
+    polynomial[:, 1, 0], polynomial[:, 0, 1] = np.radians(matrix).T
+    return PlaneMap(polynomial, origin)
 
 
 def project(ra, dec, crval):
@@ -119,7 +55,7 @@ def project(ra, dec, crval):
     >>> float(xi), float(eta)
     (0.0, 1.0001015)
     """
-    return evaluate_blocks(_Tangent(crval).project, ra, dec)
+    return evaluate_blocks(_projection(crval), ra, dec)
 
 
 def deproject(xi, eta, crval):
@@ -153,7 +89,7 @@ def deproject(xi, eta, crval):
     >>> float(ra), float(dec)
     (190.0, 89.5001)
     """
-    return evaluate_blocks(_Tangent(crval).deproject, xi, eta)
+    return evaluate_blocks(_deprojection(crval), xi, eta)
 
 
 def _check_linear(crpix, cd, crval):
@@ -264,23 +200,8 @@ class TangentSky(_Linear):
         ra, dec : ndarray
             Positions in degrees, right ascension from 0 to 360.
         """
-        return evaluate_blocks(self._block_function(crpix, cd, crval), x, y)
-
-    def _block_function(self, crpix, cd, crval):
-        (x0, y0), cd, crval = self._arrays(crpix, cd, crval)
-        (m00, m01), (m10, m11) = np.radians(cd)
-        tangent = _Tangent(crval)
-
-        def to_sky(x, y):
-            u, v = x - x0, y - y0
-            xi = m00 * u
-            xi += m01 * v
-            u *= m10
-            v *= m11
-            v += u
-            return tangent.deproject_radians(xi, v)
-
-        return to_sky
+        crpix, cd, crval = self._arrays(crpix, cd, crval)
+        return evaluate_blocks(_deprojection(crval, cd, crpix), x, y)
 
     def _after(self, plane_map):
         """Return the whole way to the sky, a `_SkyMap`.
@@ -288,13 +209,10 @@ class TangentSky(_Linear):
         It is kept for as long as it is asked for with the same map and the same parameters.
         """
         crpix, cd, crval = self.crpix.value, self.cd.value, self.crval.value
-        numbers = np.concatenate([crpix, np.ravel(cd), crval])
+        key = (crpix.tobytes(), cd.tobytes(), crval.tobytes())
         cache = self._cache
-        if cache is None or cache[0] is not plane_map or not np.array_equal(cache[1], numbers):
-            matrix = np.radians(cd)
-            to_plane = plane_map.transformed(matrix, -matrix @ crpix)
-            to_sky = _SkyMap(to_plane, _Tangent(crval), np.sqrt(abs(np.linalg.det(cd))))
-            cache = self._cache = (plane_map, numbers, to_sky)
+        if cache is None or cache[0] is not plane_map or cache[1] != key:
+            cache = self._cache = (plane_map, key, _SkyMap(plane_map, crpix, cd, crval))
         return cache[2]
 
     def __getstate__(self):
@@ -312,52 +230,64 @@ _MOST_CELLS = 40_000
 
 
 class _SkyMap:
-    """The whole way to the sky on blocks: a map to the tangent plane in radians, then the sphere.
+    """The whole way to the sky and back, on blocks: a map of the plane, the sphere behind it.
 
     Where cells lead to the sky itself as well as that, they are used for what lies inside them.
     """
 
-    def __init__(self, to_plane, tangent, scale):
-        self.to_plane = to_plane
-        self._tangent = tangent
-        self._cells = _cells_to_sky(to_plane, tangent, scale)
+    def __init__(self, plane_map, crpix, cd, crval):
+        self._plane_map = plane_map
+        self._scale = np.sqrt(abs(np.linalg.det(cd)))
+        matrix = np.radians(cd)
+        self._to_plane = plane_map.transformed(matrix, -matrix @ crpix)
+        self._tangent = kernels.tangent_numbers(crval, np.linalg.inv(cd), crpix)
+        # What was asked for last, and its function: a single point takes less than making it.
+        self._last_to_sky = self._last_from_sky = (None, None)
 
-    def __call__(self, x, y):
-        ra, dec = self.inside(x, y)
-        if self._cells is not None:
-            outside = self._cells.grid.outside(x, y)
-            if outside is not None:
-                ra[outside], dec[outside] = self._tangent.deproject_radians(
-                    *self.to_plane(x[outside], y[outside])
-                )
-        return ra, dec
+    @cached_property
+    def _grid(self):
+        return _cells_to_sky(self._to_plane, self._tangent, self._scale)
 
-    def inside(self, x, y):
-        """Map points of which only those inside the cells matter."""
-        if self._cells is None:
-            return self._tangent.deproject_radians(*self.to_plane(x, y))
-        return self._tangent.wrap(*self._cells(x, y))
+    @cached_property
+    def _cells(self):
+        return None if self._grid is None else PlaneMap(grid=self._grid).plane
 
-    def along_rows(self, x):
-        """Return a function ``function(y) -> ra, dec`` for whole rows of an image."""
-        slow = self.to_plane.along_rows(x)
-        if self._cells is None:
-            return lambda y: self._tangent.deproject_radians(*slow(y))
-        grid = self._cells.grid
-        quick = self._cells.along_rows(x)
-        x_ends = np.array([x.min(), x.max()]) if len(x) else np.empty(0)
+    def to_sky(self, box, fill_value):
+        """Return ``function(x, y, ra, dec)`` for points, with a bounding box or without."""
+        last = self._last_to_sky
+        if last[0] != (box, fill_value):
+            plane, cells, tangent = self._to_plane.plane, self._cells, self._tangent
+            numbers = kernels.box_numbers(box, fill_value)
 
-        def function(y):
-            y_ends = np.array([y.min(), y.max()]) if len(y) else np.empty(0)
-            if len(x_ends) and len(y_ends) and grid.outside(x_ends, y_ends) is not None:
-                return self._tangent.deproject_radians(*slow(y))
-            return self._tangent.wrap(*quick(y))
+            def function(x, y, ra, dec):
+                kernels.to_sky(plane, cells, tangent, numbers, x, y, ra, dec)
+
+            last = self._last_to_sky = ((box, fill_value), function)
+        return last[1]
+
+    def from_sky(self, box, fill_value):
+        """Return ``function(ra, dec, x, y)`` for points, with a bounding box or without."""
+        last = self._last_from_sky
+        if last[0] != (box, fill_value):
+            function = self._plane_map.inverse(
+                tolerance=TOLERANCE_PX, tangent=self._tangent, box=box, fill_value=fill_value
+            )
+            last = self._last_from_sky = ((box, fill_value), function)
+        return last[1]
+
+    def row_function(self, x, y):
+        """Return ``function(start, stop, ra, dec)`` for rows of an image."""
+        plane, tangent = self._to_plane.plane, self._tangent
+        cells = self._cells if self._grid is not None and self._grid.covers(x, y) else None
+
+        def function(start, stop, ra, dec):
+            kernels.rows_to_sky(plane, cells, tangent, x, y[start:stop], ra, dec)
 
         return function
 
 
 def _cells_to_sky(to_plane, tangent, scale):
-    """Return a map with the tangent plane taken into the cells of a map, or `None`.
+    """Return cells of a map with the tangent plane taken into them, or `None`.
 
     In a cell of a look-up table the sky is so nearly a plane that the projection, too, is bicubic
     to some 1e-8 px, and as quick to evaluate as the table alone.  It is not where cells are large
@@ -367,20 +297,25 @@ def _cells_to_sky(to_plane, tangent, scale):
     if grid is None or to_plane.polynomial is not None or grid.nx * grid.ny > _MOST_CELLS:
         return None
 
+    plane = to_plane.plane
+    # About a right ascension of 180 degrees, where none of them begins anew.
+    middle = tangent.copy()
+    middle[0] = 180.0
+
     def function(x, y):
-        ra, dec = tangent.offsets(*to_plane(x, y))
-        ra += tangent.ra0
+        ra, dec = np.empty((2, len(x)))
+        kernels.to_sky(plane, None, middle, None, x, y, ra, dec)
+        ra += tangent[0] - 180.0
         return ra, dec
 
-    cells = grid.interpolate(function)
+    grid = grid.interpolate(function)
     # Where the error of the interpolation is greatest.
     points = grid.points([0.0, 0.5, 1.0])
     exact = np.array(function(*points))
-    to_sky = PlaneMap(grid=cells)
-    error = to_sky(*points) - exact
+    error = np.subtract(PlaneMap(grid=grid)(*points), exact)
     error[0] *= np.cos(np.radians(exact[1]))
     # Written so that NaN counts as too much.
-    return to_sky if np.abs(error).max() <= _CELL_TOLERANCE_PX * scale else None
+    return grid if np.abs(error).max() <= _CELL_TOLERANCE_PX * scale else None
 
 
 class SkyTangent(_Linear):
@@ -417,25 +352,8 @@ class SkyTangent(_Linear):
         x, y : ndarray
             Undistorted pixel coordinates, zero based.
         """
-        return evaluate_blocks(self._block_function(crpix, cd, crval), ra, dec)
-
-    def _block_function(self, crpix, cd, crval):
-        (x0, y0), cd, crval = self._arrays(crpix, cd, crval)
-        (m00, m01), (m10, m11) = np.linalg.inv(cd)
-        tangent = _Tangent(crval)
-
-        def to_pixels(ra, dec):
-            xi, eta = tangent.project(ra, dec)
-            x = m00 * xi
-            x += m01 * eta
-            x += x0
-            xi *= m10
-            eta *= m11
-            eta += xi
-            eta += y0
-            return x, eta
-
-        return to_pixels
+        crpix, cd, crval = self._arrays(crpix, cd, crval)
+        return evaluate_blocks(_projection(crval, np.linalg.inv(cd), crpix), ra, dec)
 
     @property
     def inverse(self):
