@@ -21,7 +21,7 @@ N = 1000.0
 
 @pytest.fixture
 def compiled():
-    return pytest.importorskip("wpdc_gwcs.kernels.compiled", reason="no compiler when installed")
+    return pytest.importorskip("wpdc_gwcs.kernels._compiled", reason="no compiler when installed")
 
 
 def polynomial(degree, rng):

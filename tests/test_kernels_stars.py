@@ -14,7 +14,7 @@ CENTER = SIZE // 2
 
 @pytest.fixture
 def compiled():
-    return pytest.importorskip("wpdc_gwcs.kernels.compiled", reason="no compiler when installed")
+    return pytest.importorskip("wpdc_gwcs.kernels._compiled", reason="no compiler when installed")
 
 
 @pytest.fixture

@@ -40,7 +40,7 @@ def _choose():
         raise InputError(f"WPDC_GWCS_KERNELS must be 'compiled' or 'numpy', not {wanted!r}")
     if wanted != "numpy":
         try:
-            return "compiled", import_module("wpdc_gwcs.kernels.compiled")
+            return "compiled", import_module("wpdc_gwcs.kernels._compiled")
         except ImportError as error:
             if wanted:
                 raise InputError(

@@ -492,12 +492,20 @@ static PyMethodDef methods[] = {
     METHOD(star_steps), {NULL, NULL, 0, NULL},
 };
 
+/* Cells in memory, all of a cell side by side: four cache lines. */
+static int add_constants(PyObject *self) {
+    return PyModule_AddStringConstant(self, "CELL_ORDER", "jiqkp");
+}
+
+static PyModuleDef_Slot slots[] = {{Py_mod_exec, (void *)add_constants}, {0, NULL}};
+
 static struct PyModuleDef module = {
     .m_base = PyModuleDef_HEAD_INIT,
     .m_name = "_compiled",
     .m_doc = "The kernels, compiled.",
     .m_size = 0,
     .m_methods = methods,
+    .m_slots = slots,
 };
 
 PyMODINIT_FUNC PyInit__compiled(void) { return PyModuleDef_Init(&module); }
