@@ -269,7 +269,7 @@ class TestBadInput:
             read_catalog(write_text(tmp_path / "a.fits", "hello world\n"))
 
     def test_folder(self, tmp_path):
-        with pytest.raises(CatalogError, match="cannot be read"):
+        with pytest.raises(CatalogError, match="must be a file, is a folder"):
             read_catalog(tmp_path)
 
     def test_truncated(self, tmp_path):

@@ -73,7 +73,7 @@ def test_a_header_alone_is_text(tmp_path):
 def test_error_is_that_of_the_caller(tmp_path, error):
     with pytest.raises(error, match=r"no.fits: must be a readable file: No such file"):
         file_kind(tmp_path / "no.fits", error=error)
-    with pytest.raises(error, match="Is a directory"):
+    with pytest.raises(error, match="must be a file, is a folder"):
         file_kind(tmp_path, error=error)
 
 

@@ -689,7 +689,7 @@ class TestBadInput:
             read_frames(f"{tmp_path / 'no.fits'}[1]")
 
     def test_folder(self, tmp_path):
-        with pytest.raises(FrameError, match="Is a directory"):
+        with pytest.raises(FrameError, match="must be a file, is a folder"):
             read_frames(tmp_path)
 
     @pytest.mark.parametrize("name", ["a.fits", "a.fits.fz", "a.cat", "a.ecsv"])
