@@ -45,11 +45,14 @@ def test_what_no_star_tells_follows_the_degree_before():
 
 def test_sizes_of_few_detectors_are_uncertain():
     """One independent number for two degrees: exp(1 / (2 n)) with n = 1/2 for each at most."""
-    many = np.array([1e6, 1e6])
-    assert_allclose(inflation(many, 1), np.exp(0.5), rtol=1e-5)
-    assert_allclose(inflation(many, 100), np.exp(0.005), rtol=1e-3)
-    assert inflation(np.array([1.0, 0.2]), 1) > inflation(np.array([3.0, 2.0]), 1)
-    assert np.isfinite(inflation(np.zeros(3), 1))
+    many = np.full((1, 2), 1e6)
+    assert_allclose(inflation(many), np.exp(0.5), rtol=1e-5)
+    assert_allclose(inflation(np.repeat(many, 100, axis=0)), np.exp(0.005), rtol=1e-3)
+    # Detectors that the stars say nothing of do not count.
+    nothing = np.zeros((50, 2))
+    assert_allclose(inflation(np.concatenate([many, nothing])), np.exp(0.5), rtol=0.1)
+    assert inflation(np.array([[1.0, 0.2]])) > inflation(np.array([[3.0, 2.0]]))
+    assert np.isfinite(inflation(np.zeros((1, 3))))
 
 
 def test_errors_grow_far_from_the_stars(rng):

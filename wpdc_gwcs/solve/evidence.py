@@ -58,15 +58,13 @@ def learn_sequence(square, count, sigma, decay):
     return np.exp(log)
 
 
-def inflation(determined, holders):
+def inflation(determined):
     """Return the factor of a sequence of standard deviations for what is not known of them.
 
     Parameters
     ----------
-    determined : (G,) ndarray
-        Number of coefficients of each group that the stars determine.
-    holders : int
-        Detectors that they are the coefficients of.
+    determined : (D, G) ndarray
+        Number of coefficients of each group that the stars determine, of each detector.
 
     Returns
     -------
@@ -78,5 +76,5 @@ def inflation(determined, holders):
     The logarithm of a standard deviation is known to v = 1 / (2 n) from n independent numbers; for
     a normal distribution of the logarithm, the mean of the variance is exp(2 v) times its mode.
     """
-    known = 1.0 / (1.0 / np.maximum(determined, 1e-3) + 1.0 / (_INDEPENDENT * holders))
+    known = 1.0 / (1.0 / np.maximum(determined, 1e-3) + 1.0 / _INDEPENDENT)
     return float(np.exp(0.5 / np.sum(known)))

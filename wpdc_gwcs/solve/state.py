@@ -225,8 +225,8 @@ def _inflated(scopes, sigma, found):
             mine = variance[:, place : place + t.size] / sigma[t.name][t.groups] ** 2
             place += t.size
             if t.decay:
-                known = np.bincount(t.groups, np.sum(1.0 - mine, axis=0), len(t.start))
-                out[t.name] = sigma[t.name] * inflation(known, len(variance))
+                groups = t.groups == np.arange(len(t.start))[:, None]
+                out[t.name] = sigma[t.name] * inflation((1.0 - mine) @ groups.T)
     return out
 
 
