@@ -430,6 +430,26 @@ def test_cpdis_of_others_is_not_read_in_part(tmp_path, calibration):
         read_wcs(fits.getheader(tmp_path / "b.fits"))
 
 
+@pytest.mark.parametrize("form", ["fits", "cpdis"])
+def test_a_file_that_ends_between_two_hdus(tmp_path, calibration, form):
+    """To FITS it is whole; without its tables the WCS would be another one."""
+    write(calibration, tmp_path / "a.fits", format=form)
+    content = (tmp_path / "a.fits").read_bytes()
+    with fits.open(tmp_path / "a.fits") as hdus:
+        ends = [hdu.fileinfo()["datLoc"] + hdu.fileinfo()["datSpan"] for hdu in hdus]
+    assert ends[-1] == len(content)
+    for end in ends[:-1]:
+        # Zeros behind the end are what the standard calls special records.
+        for rest in (b"", bytes(2880)):
+            (tmp_path / "b.fits").write_bytes(content[:end] + rest)
+            with pytest.raises(FileFormatError, match="b.fits: "):
+                read(tmp_path / "b.fits")
+    if form == "fits":
+        fits.getheader(tmp_path / "a.fits").totextfile(tmp_path / "a.hdr")
+        with pytest.raises(FileFormatError, match="tables WPDC_... that its keyword WPDCTAB"):
+            read(tmp_path / "a.hdr")
+
+
 def test_cpdis_says_when_it_cannot(tmp_path, monkeypatch, calibration):
     monkeypatch.setattr("wpdc_gwcs.export.cpdis._MOST_NODES", 10)
     with pytest.warns(WPDCWarning, match="cannot be made dense enough"):
@@ -739,7 +759,7 @@ class TestBadFits:
             read(tmp_path / "a.fits")
 
     def test_several_headers(self, tmp_path, calibration):
-        write(calibration, tmp_path / "a.fits")
+        write(calibration, tmp_path / "a.fits", format="tpv")
         header = fits.getheader(tmp_path / "a.fits")
         images = [fits.ImageHDU(np.zeros((2, 2)), header, name=n) for n in ("A", "B")]
         fits.HDUList([fits.PrimaryHDU(), *images]).writeto(tmp_path / "b.fits")

@@ -50,6 +50,7 @@ def own_tables(obj, *, version=1):
         for name, (form, unit, value) in values.items()
     ]
     instrument = fits.BinTableHDU.from_columns(columns, name=INSTRUMENT_NAME, ver=version)
+    instrument.header["WPDCLUT"] = (table is not None, "whether WPDC_LUT belongs to it")
     instrument.header.add_comment("CRPIX counts from zero; PV: axis 1, axis 2, by FITS index")
     if table is None:
         return [instrument]

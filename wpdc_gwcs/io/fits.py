@@ -189,6 +189,7 @@ def read_fits(path):
         if not 0 <= number < len(headers):
             raise FileFormatError(f"{path}: header number must be < {len(headers)}, got {number}")
         header = headers[number]
+        _require_no_tables(header, path)
     version = header_text(header, "WPDCVERS")
     if version:
         check_version(version, path)
@@ -212,13 +213,33 @@ def read_fits(path):
 
 
 def _read_own_tables(hdus, header, path):
-    """Read the look-up table and the instrument of a header of this package."""
+    """Read the look-up table and the instrument of a header of this package.
+
+    A file that ends between two HDUs is whole to FITS, but these belong together.
+    """
     version = header_number(header, "WPDCTAB", name=str(path), required=False, default=1)
     found = []
     for name, reader in ((TABLE_NAME, _read_table), (INSTRUMENT_NAME, _read_instrument)):
         key = (name, int(version))
         found.append(reader(hdus[key], f"{path}[{name}]") if key in hdus else None)
-    return found
+    table, instrument = found
+    if instrument is None and table is None:
+        _require_no_tables(header, path)
+    if instrument is not None and table is None:
+        if hdus[INSTRUMENT_NAME, int(version)].header.get("WPDCLUT") is True:
+            raise FileFormatError(
+                f"{path}: truncated file: must have the table {TABLE_NAME} that belongs to "
+                f"{INSTRUMENT_NAME}, has none"
+            )
+    return table, instrument
+
+
+def _require_no_tables(header, path):
+    if "WPDCTAB" in header:
+        raise FileFormatError(
+            f"{path}: must have the tables WPDC_... that its keyword WPDCTAB refers to, has none: "
+            "cut short, or a header that was copied without them (export it as tpv or head)"
+        )
 
 
 def _only(numbers, path):
