@@ -1,6 +1,7 @@
 """The reference pages say what the program does: every command, option, default and name."""
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -114,3 +115,12 @@ def test_flags_are_documented():
     page = read_page("reference/files.rst")
     documented = {n: int(v) for v, n in re.findall(r"^(\d+) +``(FLAG_\w+)``", page, flags=re.M)}
     assert documented == {n: getattr(detection, n) for n in dir(detection) if n.startswith("FLAG_")}
+
+
+def test_layout_is_that_of_the_import_contract():
+    layout = runpy.run_path(str(DOCS / "figures" / "layout.py"))
+    page = (DOCS.parent / "CONTRIBUTING.rst").read_text(encoding="utf-8")
+    assert layout["draw"]() in page, "run: python docs/figures/layout.py"
+    modules = {m for layer in layout["layers"]() for m in layer}
+    package = DOCS.parent / "wpdc_gwcs"
+    assert all((package / m).is_dir() or (package / f"{m}.py").is_file() for m in modules)
