@@ -168,7 +168,7 @@ def test_a_change_is_told_and_dated(halves, followed):
     kept = read(kept)
     assert (kept.valid_from, kept.valid_to) == (None, new.valid_from)
     assert kept.residual_map == old.residual_map
-    assert new.provenance["epochs"] == [2016.0, entry["last_epoch"]] or (
+    assert new.provenance["epochs"] == (2016.0, entry["last_epoch"]) or (
         abs(new.provenance["epochs"][0] - 2016.0) < 0.01
     )
     assert len(new.provenance["inputs"]) == 6

@@ -143,7 +143,7 @@ def test_calibration_asdf_round_trip(tmp_path, calibration):
     assert back.solution.residual_map is None  # the solution's own file has it
     assert back.statistics == {"rms_mas": 12.5}
     assert back.solution.settings == calibration.solution.settings
-    assert back.solution.provenance["inputs"] == ["a.fits", "b.fits"]
+    assert back.solution.provenance["inputs"] == ("a.fits", "b.fits")
     assert os.listdir(tmp_path) == ["e00.wcs.asdf"]
 
 
