@@ -33,11 +33,11 @@ def rms(values):
     return np.sqrt(np.mean(np.sum(values**2, axis=0)))
 
 
-def fitted(rng, truth, n, sigma=SIGMA, **options):
+def fitted(rng, truth, n, sigma=SIGMA):
     focal = places(rng, n)
     errors = sigma * rng.uniform(0.5, 1.5, (2, n))
     residual = truth(focal) + rng.normal(size=(2, n)) * errors
-    waves = fit_waves(LOW, HIGH, focal, residual, errors**2, **options)
+    waves = fit_waves(LOW, HIGH, focal, residual, errors**2)
     grid = places(rng, 3000)
     return waves, grid, without_polynomials(grid, waves(grid) - truth(grid))
 
@@ -57,18 +57,6 @@ def test_noise_stays_out(rng, n):
     # A small part of what the 850 candidates would take of the noise.
     taken = rms(without_polynomials(grid, waves(grid)))
     assert taken < 0.15 * SIGMA * np.sqrt(2 * min(850, n) / n)
-
-
-def test_only_sure_waves_are_kept(rng):
-    """The noise is less, and what stands out is still found."""
-    truth = some_waves(rng)
-    waves, grid, error = fitted(rng, truth, 12_000, sure=True)
-    assert waves.orders.shape[1] < 40
-    assert rms(error) < 0.25 * rms(truth(grid))
-    nothing, grid, _ = fitted(rng, lambda focal: np.zeros_like(focal), 12_000, sure=True)
-    assert nothing.orders.shape[1] >= 1
-    taken = rms(without_polynomials(grid, nothing(grid)))
-    assert taken < 0.1 * SIGMA * np.sqrt(2 * 850 / 12_000)
 
 
 def test_uncertainty_is_that_of_the_errors(rng):

@@ -26,7 +26,7 @@ _LEAST_WAVES = 100
 _STEPS_WAVES = 98
 
 # With more stars on each detector than this, its table finds by itself what else the exposures
-# share, in more detail than a field or waves that may be there.
+# share, in more detail than a field.
 _TABLE_ALONE = 6000
 
 # Waves of what the exposures of a detector share, and stars that its spectrum is learnt from.
@@ -198,8 +198,7 @@ def with_statics(o, state):
         stars[k] += [np.concatenate([p[i] for p in parts], axis=1) for i in (1, 2)]
         if stars[k][0].shape[1] >= _LEAST_WAVES:
             box = _box(o, state, k, 0.0)
-            waves = fit_waves(*box, *stars[k], sure=stars[k][0].shape[1] > _TABLE_ALONE)
-            statics[k] = of_field(waves, *box, least_steps=_STEPS_WAVES)
+            statics[k] = of_field(fit_waves(*box, *stars[k]), *box, least_steps=_STEPS_WAVES)
             stars[k][1] = stars[k][1] - statics[k](stars[k][0])
     for k, field in _common_fields(o, state, stars).items():
         statics[k] = SummedField((statics[k], field)) if k in statics else field

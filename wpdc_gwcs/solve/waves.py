@@ -48,10 +48,6 @@ _STEPS = 8
 # so many coefficients: a wave between two candidates would need many of them.
 _ZOOMS, _SEEN = 2, 0.5
 
-# Of the four coefficients of a wave, those that the stars must determine where a table takes the
-# rest: it does so with less noise than a hundred waves that may be there.
-_SURE = 2.5
-
 # Most waves that a finer step is tried for; those of the largest power.
 _MOST_ZOOMED = 60
 
@@ -199,7 +195,7 @@ def _finer(orders, strong):
     return np.unique(every[:, np.any(every != 0, axis=0)], axis=1)
 
 
-def fit_waves(low, high, focal, residual, variance, *, sure=False):
+def fit_waves(low, high, focal, residual, variance):
     """Find the waves of a detector.
 
     Parameters
@@ -208,8 +204,6 @@ def fit_waves(low, high, focal, residual, variance, *, sure=False):
         Corners of its part of the focal plane, px.
     focal, residual, variance : (2, N) ndarray
         Places, residuals and their variances, px.
-    sure : bool, optional
-        Keep only those waves that the stars determine.
 
     Returns
     -------
@@ -245,14 +239,6 @@ def fit_waves(low, high, focal, residual, variance, *, sure=False):
             break
         strong = seen[np.argsort(-root[seen], kind="stable")[:_MOST_ZOOMED]]
         orders, step = _finer(orders[:, seen], orders[:, strong]), 0.5 * step
-    if sure:
-        # Two coefficients of each wave, of one at least; what else there is stays.
-        stands = known >= min(_SURE, known.max())
-        kept = np.ones(len(root), bool)
-        kept[: 2 * len(known)] = np.tile(stands, 2)
-        orders, normal, right = orders[:, stands], normal[np.ix_(kept, kept)], right[kept]
-        root, taken = root[kept], taken[:, kept]
-        shape = center, size, orders, step, least_degree
     half = lapack.dtrtrs(_factor(normal, root), np.diag(root), lower=1)[0]
     return Waves(*shape, (half.T @ (half @ right)).T, taken, half.astype(np.float32))
 
