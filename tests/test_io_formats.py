@@ -215,6 +215,17 @@ def test_files_satisfy_the_schemas_of_asdf(tmp_path, table):
             asdf.open(tmp_path / "b.asdf")
 
 
+@pytest.mark.parametrize("table", ["linear", "cubic"])
+def test_the_stock_wcs_outlives_its_file(tmp_path, table):
+    calibration = make_calibration(table=table)
+    write(calibration, tmp_path / "a.wcs.asdf")
+    with asdf.open(tmp_path / "a.wcs.asdf") as file:
+        wcs = file["wcs"]
+    sky = wcs(100.0, 200.0)
+    assert np.hypot(*np.subtract(sky, calibration.wcs(100.0, 200.0))) < 1e-9
+    assert np.allclose(wcs.invert(*sky), (100.0, 200.0), rtol=0, atol=1e-2)
+
+
 def edited(path, tmp_path, edit):
     """A file with other values, and a sum that agrees with them."""
     with asdf.open(path, lazy_load=False, memmap=False) as file:

@@ -573,10 +573,12 @@ def _with_outer_nodes(table):
 
 
 def _stock_table(x_grid, y_grid, values, method):
+    # The same for both, so that files have them once.
+    points = (np.array(x_grid), np.array(y_grid))
     return _pair(
         *(
             Tabular2D(
-                points=(np.array(x_grid), np.array(y_grid)),
+                points=points,
                 lookup_table=np.ascontiguousarray(value.T),
                 method="splinef2d" if method == "cubic" else "linear",
                 # The spline does not extrapolate, and an error at the first point outside helps

@@ -38,6 +38,7 @@ from pathlib import Path
 import asdf
 import numpy as np
 from asdf.extension import Extension, TagDefinition
+from astropy.modeling import CompoundModel
 
 from wpdc_gwcs.camera import Camera
 from wpdc_gwcs.exceptions import FileFormatError, InputError
@@ -54,8 +55,7 @@ __all__ = ["read_asdf", "read_asdf_wcs", "sum_of", "write_asdf", "write_stock"]
 _NOT_STORED = {"matches", "sources"}
 _NOT_IN_FRAMES = {"residual_map"}
 _FIRST_WITH_SUM = (1, 2)
-# Arrays of up to so many values stand in the tree, where they are legible: CRPIX, CD, a cubic.  The
-# nodes of tables do not: as text they take more time than all else.
+# Arrays of up to so many values stand in the tree, where they are legible: CRPIX, CD, a cubic.
 _INLINE_VALUES = 20
 
 
@@ -265,6 +265,16 @@ def _unchecked(extensions):
     return _Unchecked(dict.fromkeys(tag.tag_uri for one in extensions for tag in one.tags))
 
 
+def _points_of(model):
+    """Yield the nodes of all tables that a model is made of, its inverse included."""
+    if isinstance(model, CompoundModel):
+        yield from _points_of(model.left)
+        yield from _points_of(model.right)
+    if model.has_user_inverse:
+        yield from _points_of(model.inverse)
+    yield from getattr(model, "points", ())
+
+
 def _write_tree(tree, path, overwrite, compression=None):
     # A context copies what is loaded: extensions are to be looked for once, not for every file.
     unchecked = _unchecked(tuple(asdf.get_config().extensions))
@@ -274,7 +284,10 @@ def _write_tree(tree, path, overwrite, compression=None):
         # Open, because asdf takes a path for a URL, in which '#', '?', ';' and '%' end the name.
         open(temporary, "wb") as stream,
     ):
-        config.array_inline_threshold = _INLINE_VALUES
+        # Stock tables keep their nodes as they come from the file, which may be closed by then.
+        steps = tree["wcs"].pipeline[:-1] if "wcs" in tree else ()
+        nodes = [points.size for step in steps for points in _points_of(step.transform)]
+        config.array_inline_threshold = 1 + max([_INLINE_VALUES, *nodes])
         file = asdf.AsdfFile(tree, extensions=[unchecked])
         file.write_to(stream, all_array_compression=compression)
 
