@@ -16,6 +16,11 @@ LOW, HIGH = np.array([-1000.0, -600.0]), np.array([1000.0, 900.0])
 KINDS = ("curl-free", "axes")
 
 
+def design_of(basis, focal, kind="curl-free"):
+    """Displacements of unit coefficients, a column for each: ``(2, N, K)``."""
+    return np.moveaxis(basis.shapes(focal, kind), 0, -1)
+
+
 def places(rng, n, low=LOW, high=HIGH):
     return low[:, None] + (high - low)[:, None] * rng.uniform(size=(2, n))
 
@@ -23,7 +28,7 @@ def places(rng, n, low=LOW, high=HIGH):
 def dense(basis, spectrum, here, there=None):
     """Covariance ``(2 N, 2 M)`` of the field between places, by the waves one by one."""
     rows = [
-        basis.design(f, spectrum.kind).reshape(2 * f.shape[1], -1)
+        design_of(basis, f, spectrum.kind).reshape(2 * f.shape[1], -1)
         for f in (here, here if there is None else there)
     ]
     return sum(p * np.outer(a, b) for p, a, b in zip(spectrum.prior(basis), rows[0].T, rows[1].T))
@@ -57,7 +62,7 @@ class TestBasis:
         basis, step = patch(LOW, HIGH, 30), 1e-3
         focal = places(rng, 20)
         right, up = focal + [[step], [0]], focal + [[0], [step]]
-        design = [basis.design(f)[:, :, :-2] for f in (focal, right, up)]
+        design = [design_of(basis, f)[:, :, :-2] for f in (focal, right, up)]
         curl = (design[1][1] - design[0][1]) - (design[2][0] - design[0][0])
         slope = np.abs(design[1] - design[0]).max()
         assert_allclose(curl / slope, 0, atol=1e-5)
@@ -66,15 +71,15 @@ class TestBasis:
         """The displacement is the gradient of the waves that 'axes' has along each axis."""
         basis, step = patch(LOW, HIGH, 30), 1e-3
         focal = places(rng, 20)
-        wave = [basis.design(focal + s, "axes")[0, :, :30] for s in
+        wave = [design_of(basis, focal + s, "axes")[0, :, :30] for s in
                 ([[step], [0]], [[-step], [0]], [[0], [step]], [[0], [-step]])]  # fmt: skip
-        design = basis.design(focal)
+        design = design_of(basis, focal)
         assert_allclose((wave[0] - wave[1]) / (2 * step), design[0, :, :30], atol=1e-11)
         assert_allclose((wave[2] - wave[3]) / (2 * step), design[1, :, :30], atol=1e-11)
 
     @pytest.mark.parametrize("kind", KINDS)
     def test_constants_are_last(self, rng, kind):
-        design = patch(LOW, HIGH, 5).design(places(rng, 3), kind)
+        design = design_of(patch(LOW, HIGH, 5), places(rng, 3), kind)
         assert_allclose(design[:, :, -2:], np.broadcast_to(np.eye(2)[:, None], (2, 3, 2)))
 
 
@@ -87,7 +92,7 @@ class TestSpectrum:
         basis = patch(LOW, HIGH, 400)
         # Waves vanish at the rim, and with them a little of the variance near it.
         inner = places(rng, 200, 0.7 * LOW, 0.7 * HIGH)
-        variance = np.mean(basis.design(inner, kind) ** 2, axis=1) @ spectrum.prior(basis)
+        variance = np.mean(design_of(basis, inner, kind) ** 2, axis=1) @ spectrum.prior(basis)
         total = variance + spectrum.unresolved(basis)
         # The rim is a quarter of the longer outer scale away.
         assert_allclose(total.mean(), 0.07**2, rtol=0.1 if scale == 300 else 0.2)
@@ -101,7 +106,7 @@ class TestSpectrum:
         for distance in (100.0, 300.0, 700.0):
             angle = rng.uniform(0, 2 * np.pi, 100)
             there = here + distance * np.array([np.cos(angle), np.sin(angle)])
-            rows = basis.design(here, kind), basis.design(there, kind)
+            rows = design_of(basis, here, kind), design_of(basis, there, kind)
             both = np.einsum("anm,m,anm->n", rows[0], spectrum.prior(basis), rows[1]).mean() / 2
             # A hundred pairs of places; the patch is six outer scales wide.
             assert_allclose(both, von_karman(distance, 800.0), atol=0.03)
@@ -207,7 +212,7 @@ def simulated(rng, spectrum, basis, *, n=250, noise=0.02):
     focal = places(rng, n)
     prior = spectrum.prior(basis)
     coefficients = np.sqrt(prior) * rng.normal(size=len(prior))
-    residual = basis.design(focal, spectrum.kind) @ coefficients + rng.normal(0, noise, (2, n))
+    residual = design_of(basis, focal, spectrum.kind) @ coefficients + rng.normal(0, noise, (2, n))
     return focal, residual, np.full((2, n), noise**-2)
 
 
@@ -289,7 +294,7 @@ class TestLearnSpectra:
         data = {}
         for e in range(4):
             focal = places(rng, 250)
-            field = basis.design(focal) @ (common + share * own[e])
+            field = design_of(basis, focal) @ (common + share * own[e])
             noise = rng.normal(0, 0.02, field.shape)
             data[e] = focal, field + noise, np.full(field.shape, 0.02**-2)
 

@@ -6,10 +6,9 @@
 """
 
 import logging
-import re
 
 from wpdc_gwcs.exceptions import FrameError
-from wpdc_gwcs.io.companions import SCIENCE_WORDS, WCS_KEYS, map_role
+from wpdc_gwcs.io.companions import SCIENCE_WORDS, WCS_KEYS, map_role, words_of
 from wpdc_gwcs.io.files import file_kind, open_fits, split_extension, stem_of
 from wpdc_gwcs.io.frames import read_frames
 from wpdc_gwcs.io.headers import header_text
@@ -75,7 +74,7 @@ def tell_frames(paths):
     names = {}
     for path in paths:
         if split_extension(path)[1] is None:
-            names.setdefault(tuple(_words(path)), path)
+            names.setdefault(tuple(words_of(stem_of(path))), path)
     maps, owners = {}, {}
     for path in paths:
         if split_extension(path)[1] is not None:
@@ -88,13 +87,9 @@ def tell_frames(paths):
     return [(path, maps.get(str(path), [])) for path in paths if str(path) not in owners]
 
 
-def _words(path):
-    return re.findall(r"[A-Z]+|\d+", stem_of(path).upper())
-
-
 def _owners(path, names):
     """Files of the list whose names lack what this one's says of masks and weights."""
-    words = _words(path)
+    words = words_of(stem_of(path))
     for first in range(len(words)):
         for last in range(first + 1, min(first + _MOST_WORDS, len(words)) + 1):
             if map_role(words[first:last]) is None:

@@ -29,6 +29,7 @@ __all__ = [
     "load_weight",
     "map_beside",
     "map_role",
+    "words_of",
     "pair_companions",
 ]
 
@@ -147,8 +148,20 @@ def _shape(hdu):
     return tuple(hdu.header.get(f"NAXIS{k}") for k in (1, 2))
 
 
-def _words(hdu):
-    return re.findall(r"[A-Z]+|\d+", hdu.name.upper())
+def words_of(name):
+    """Split the name of an extension or a file into its words and numbers.
+
+    Parameters
+    ----------
+    name : str
+        The name.
+
+    Returns
+    -------
+    list of str
+        In capitals, in order.
+    """
+    return re.findall(r"[A-Z]+|\d+", name.upper())
 
 
 def _role_of(hdu):
@@ -157,7 +170,7 @@ def _role_of(hdu):
         text = header_text(hdu.header, key).upper()
         if text in _CLASS_VALUES or text in _CLASSES:
             return _CLASS_VALUES.get(text) or _CLASSES[text]
-    return _role_by(_words(hdu), _ROLES)
+    return _role_by(words_of(hdu.name), _ROLES)
 
 
 def _role_by(words, roles):
@@ -190,7 +203,7 @@ def _kinship(frame, other):
     rest = [
         [
             w
-            for w in _words(h)
+            for w in words_of(h.name)
             if w not in SCIENCE_WORDS and not any(w in n for n in _ROLES.values())
         ]
         for h in (frame, other)
@@ -209,7 +222,7 @@ def _is_twin(frame, other):
     if not (_same(frame, other, WCS_KEYS) and _same(frame, other, _IDENTITY)):
         return False
     # Numbers apart, detectors of one camera have one name.
-    kind = [[w for w in _words(h) if not w.isdigit()] for h in (frame, other)]
+    kind = [[w for w in words_of(h.name) if not w.isdigit()] for h in (frame, other)]
     return kind[0] != kind[1]
 
 
@@ -293,8 +306,7 @@ def map_beside(path, frame_index, frame_name, shape):
     Companion
         Where it is, and what, by the name of the file.
     """
-    words = re.findall(r"[A-Z]+|\d+", stem_of(path).upper())
-    role = map_role(words)
+    role = map_role(words_of(stem_of(path)))
     found = given_plane(path, frame_index, frame_name, shape, role)
     return replace(found, role=role, given=False)
 

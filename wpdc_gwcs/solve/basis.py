@@ -40,26 +40,8 @@ class Basis:
         """Wave vectors ``(2, M)``, rad / px."""
         return 0.5 * np.pi * self.orders / self.half[:, None]
 
-    def design(self, focal, kind="curl-free"):
-        """Displacements of unit coefficients, ``(2, N, K)``: K is M or 2 M, and 2, and 14 of bends.
-
-        Parameters
-        ----------
-        focal : (2, N) ndarray
-            Focal plane, px.
-        kind : {'curl-free', 'axes'}, optional
-            Gradient of a potential, or each axis by itself.
-
-        Returns
-        -------
-        ndarray
-            Waves first, then polynomials, degree by degree along each axis; the last two columns
-            are a constant along each axis.
-        """
-        return np.moveaxis(self.shapes(focal, kind), 0, -1)
-
     def shapes(self, focal, kind="curl-free"):
-        """Return `design` with the coefficients first, as it lies in memory: ``(K, 2, N)``.
+        """Displacements of unit coefficients, ``(K, 2, N)``: K is M or 2 M, and 2, and 14 of bends.
 
         Parameters
         ----------
@@ -71,7 +53,8 @@ class Basis:
         Returns
         -------
         ndarray
-            In the same order.
+            Waves first, then polynomials, degree by degree along each axis; the last two are a
+            constant along each axis.
         """
         phases = [
             np.outer(

@@ -94,7 +94,7 @@ class Change:
 
 def _waves(basis, focal):
     m = basis.orders.shape[1]
-    return basis.design(focal, "axes")[0, :, :m]
+    return basis.shapes(focal, "axes")[:m, 0].T
 
 
 def _power(spectrum, basis):

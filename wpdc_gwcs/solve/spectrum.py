@@ -28,15 +28,15 @@ _LOG_STRETCH_SCATTER = 0.5
 # Exposures, and frames of each, that the pooled spectrum is learnt from.
 _EXPOSURES_POOLED, _FRAMES_POOLED = 8, 2
 
-# Gain in log evidence that fields must bring to all exposures together, and what a stretch (two
-# numbers more) must add to one that is well above it.
+# Gain in log evidence that fields must bring to all exposures together, and what more must add: a
+# stretch (two numbers) to one that is well above it, the bend of one exposure where others bend.
 _LEAST_GAIN = 5.0
-_STRETCH_GAIN = 3.0
+_MORE_GAIN = 3.0
 _GAIN_FOR_STRETCH = 30.0
 
-# The same of polynomials beside the waves: much, for turbulence bends a detector as well, and where
-# exposures really bend, some of them bring 50 nats and more.  Their first guess in units of the
-# amplitude, and how much smaller a degree is than the one before.
+# The same of polynomials beside the waves of all exposures: much, for turbulence bends a detector
+# as well, and where exposures really bend, some of them bring 50 nats and more.  Their first guess
+# in units of the amplitude, and how much smaller a degree is than the one before.
 _BEND_GAIN, _FIRST_BEND, _BEND_DECAY = 10.0, 0.3, 1.8
 
 
@@ -83,7 +83,7 @@ class Spectrum:
         Returns
         -------
         ndarray
-            For the columns of ``basis.design(..., kind)``.
+            For ``basis.shapes(..., kind)``.
         """
         wave = basis.wave
         k0 = 2 * np.pi / self.scale
@@ -303,10 +303,7 @@ def _maximize(group, kind, start, scales, about=None):
         return Spectrum(float(np.exp(p[0])), float(scale), float(stretch), float(angle), kind)
 
     def penalty(p):
-        beyond = max(low - p[1], p[1] - high, 0.0)
-        total = beyond**2
-        if about is not None:
-            total += _distance(p, about)
+        total = _penalty(p, scales, about)
         if len(p) == 4:
             total += 0.5 * (p[2] ** 2 + p[3] ** 2) / _LOG_STRETCH_SCATTER**2
         return total
@@ -336,11 +333,11 @@ def _maximize(group, kind, start, scales, about=None):
         four = minimize(cost, p4, method="Nelder-Mead",
                         options={"xatol": 0.03, "fatol": 0.1, "maxfev": 120,
                                  "initial_simplex": p4 + steps})  # fmt: skip
-        if -four.fun > gain + _STRETCH_GAIN:
+        if -four.fun > gain + _MORE_GAIN:
             p, gain = four.x, -four.fun
     found = spectrum_of(p)
     if about is not None and about.bend:
-        return max((found, gain + _STRETCH_GAIN), _bent(group, found, scales, about), key=_gain)
+        return max((found, gain + _MORE_GAIN), _bent(group, found, scales, about), key=_gain)
     return found, gain
 
 
@@ -348,12 +345,14 @@ def _gain(found):
     return found[1]
 
 
-def _distance(p, about):
-    """Minus the log prior of amplitude and scale of one exposure about those of all."""
-    return (
-        0.5 * ((p[0] - np.log(about.amplitude)) / _LOG_AMPLITUDE_SCATTER) ** 2
-        + 0.5 * ((p[1] - np.log(about.scale)) / _LOG_SCALE_SCATTER) ** 2
-    )
+def _penalty(p, scales, about):
+    """Minus the log prior of amplitude and scale: within limits, and about those of all."""
+    low, high = np.log(scales)
+    total = max(low - p[1], p[1] - high, 0.0) ** 2
+    if about is not None:
+        total += 0.5 * ((p[0] - np.log(about.amplitude)) / _LOG_AMPLITUDE_SCATTER) ** 2
+        total += 0.5 * ((p[1] - np.log(about.scale)) / _LOG_SCALE_SCATTER) ** 2
+    return total
 
 
 def _bent(group, straight, scales, about=None):
@@ -368,9 +367,8 @@ def _bent(group, straight, scales, about=None):
     def cost(p):
         if np.any(p[[0, 2]] < -25) or np.any(p[[0, 2]] > 10):
             return 1e12
-        total = max(low - p[1], p[1] - high, 0.0) ** 2
+        total = _penalty(p, scales, about)
         if about is not None:
-            total += _distance(p, about)
             total += 0.5 * ((p[2] - np.log(about.bend)) / _LOG_AMPLITUDE_SCATTER) ** 2
         spectrum = spectrum_of(p)
         return total - sum(g.log_evidence(spectrum) for g in group)
