@@ -111,3 +111,28 @@ def test_candidates(size):
     assert number.max() <= 2 * np.pi / (0.1 * max(size)) * (1 + 1e-12)
     both = np.hstack([orders, -orders])
     assert len(set(map(tuple, both.T))) == both.shape[1]
+
+
+def roll_off(focal, size=0.02, length=8.0):
+    """A detector's stars move inward at its rims, within some pixels."""
+    return size * (
+        np.exp(-(focal - LOW[:, None]) / length) - np.exp(-(HIGH[:, None] - focal) / length)
+    )
+
+
+def test_rims_get_what_a_table_can_take(rng):
+    waves = some_waves(rng)
+    n = 45_000
+    focal = places(rng, n)
+    noise = SIGMA * rng.normal(size=(2, n))
+    found = fit_waves(
+        LOW, HIGH, focal, roll_off(focal) + waves(focal) + noise, np.full((2, n), SIGMA**2)
+    )
+    grid = places(rng, 40_000)
+    left = without_polynomials(grid, found(grid) - roll_off(grid) - waves(grid))
+    rim = np.min([*(grid - LOW[:, None]), *(HIGH[:, None] - grid)], axis=0) < 40
+    # With steps of 80 px half of the roll-off's energy, and more, remains.
+    assert rms(left[:, rim]) < 0.8 * rms(roll_off(grid[:, rim]))
+    # Where there is none, none is seen.
+    none = fit_waves(LOW, HIGH, focal, waves(focal) + noise, np.full((2, n), SIGMA**2))
+    assert np.abs(none.coefficients[:, -4:]).max() < 0.003

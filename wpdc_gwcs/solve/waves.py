@@ -33,10 +33,10 @@ _FREE_DEGREE, _STARS_PER_TERM = 5, 40
 
 # Detectors roll off within some pixels of their rims.  A table takes of it what its outermost nodes
 # can: these are shapes, too, of a table of so many nodes.
-_NODES = 50
+_NODES, _RIMS = 50, 4
 _OUTERMOST = CubicSpline(np.arange(_NODES), np.eye(_NODES)[0])
 
-# Share of the variance that a coefficient has by itself, from all stars, which is left to a wave
+# Share of the variance that a coefficient has by itself, from its stars, which is left to a wave
 # that is not seen, and the number of coefficients that this guess is worth.  In noise alone a
 # quarter of a coefficient for each ten candidates remains, in units of its error.
 _FLOOR, _GUESS_WEIGHT = 0.02, 1.0
@@ -232,8 +232,8 @@ def fit_waves(low, high, focal, residual, variance):
     least_degree = max(np.count_nonzero(terms * _STARS_PER_TERM <= focal.shape[1]), 2)
     for zoom in range(_ZOOMS + 1):
         shape = center, size, orders, step, least_degree
-        normal, right, taken = _normal_equations(shape, focal, residual, weight)
-        root, known = _learned(normal, right, orders.shape[1], _FLOOR / weight.sum())
+        normal, right, taken, told = _normal_equations(shape, focal, residual, weight)
+        root, known = _learned(normal, right, told, orders.shape[1])
         seen = np.flatnonzero(known > _SEEN)
         if zoom == _ZOOMS or not seen.size:
             break
@@ -243,10 +243,14 @@ def fit_waves(low, high, focal, residual, variance):
     return Waves(*shape, (half.T @ (half @ right)).T, taken, half.astype(np.float32))
 
 
-def _learned(normal, right, n, least):
+def _learned(normal, right, told, n):
     """Prior standard deviation of each coefficient, and how many of each wave are determined."""
-    group = np.concatenate([np.arange(n), np.arange(n), np.arange(n, len(normal) - n)])
-    power = np.full(group[-1] + 1, 10.0 * least)
+    own = np.arange(n, len(normal) - n)
+    # A detector that rolls off at one rim does so at all.
+    group = np.concatenate([np.arange(n), np.arange(n), np.minimum(own, own[-_RIMS])])
+    # What its own stars tell, those at a rim are few; waves have half of all stars each.
+    least = _FLOOR * np.bincount(group) / np.bincount(group, 2.0 * told)
+    power = 10.0 * least
     for _ in range(_STEPS):
         root = np.sqrt(power)[group]
         factor = _factor(normal, root)
@@ -286,6 +290,7 @@ def _normal_equations(shape, focal, residual, weight):
         total[shapes, shapes] - cross.T @ taken,
         total[shapes, k:] - cross.T @ solved[:, -2:],
         taken,
+        np.diagonal(total)[shapes],
     )
 
 
