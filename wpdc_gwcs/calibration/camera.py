@@ -11,6 +11,7 @@ import numpy as np
 from astropy.table import Table
 
 from wpdc_gwcs.calibration.checks import check_solution, shortcomings
+from wpdc_gwcs.calibration.free_stars import solve_free_stars
 from wpdc_gwcs.calibration.literal import solve_frames_literally
 from wpdc_gwcs.calibration.positions import with_sky_positions
 from wpdc_gwcs.calibration.settings import Settings
@@ -42,6 +43,7 @@ _REMATCH_SIGMAS = 5.0
 _UNITS = {
     **dict.fromkeys(("x", "y", "x_err", "y_err", "dx", "dy"), "pix"),
     **dict.fromkeys(("ra", "dec"), "deg"),
+    **dict.fromkeys(("ra_offset", "dec_offset"), "mas"),
 }
 
 
@@ -140,23 +142,17 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
     if not group:
         return {}, [], failures
     pairs = [frame.pairs for frame in group]
+    options = {
+        "image_shape": shapes, "crpix": crpix, "weight": _weights(settings, shapes),
+        "degree": settings.degree, "n_grid": settings.n_grid, "lut": settings.lut,
+        "refine": settings.refine, "solution": solution or None, "update": update,
+        "seed": settings.seed,
+    }  # fmt: skip
     choice = None
     for attempt in range(_MAX_REMATCH):
+        exposures = [_exposure(f, p, attitudes[f.name], holdout) for f, p in zip(group, pairs)]
         try:
-            result = solve(
-                [_exposure(f, p, attitudes[f.name], holdout) for f, p in zip(group, pairs)],
-                image_shape=shapes,
-                crpix=crpix,
-                weight=_weights(settings, shapes),
-                degree=settings.degree,
-                n_grid=settings.n_grid,
-                lut=settings.lut,
-                refine=settings.refine,
-                solution=solution or None,
-                update=update,
-                table_choice=choice,
-                seed=settings.seed,
-            )
+            result = solve(exposures, table_choice=choice, **options)
         except FitError as err:
             return {}, [], failures | _own_reasons(group, err)
         if len(result.table_infos) == len(shapes):
@@ -184,6 +180,11 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
                 attitudes[frame.name] = LinearWCS(
                     crpix=crpix[frame.detector], cd=fit.cd, crval=fit.crval
                 )
+    if settings.free_stars:
+        try:
+            result = solve_free_stars(exposures, result, partial(solve, **options))
+        except FitError as err:
+            return {}, [], failures | _own_reasons(group, err)
     return _delivered(
         group, pairs, result, settings, holdout, solution, failures, began, update=update
     )
@@ -372,7 +373,7 @@ def _exposure(frame, pairs, attitude, holdout):
     """Gather what the joint solution needs: pairs with the errors of both sides in px."""
     i_src, i_ref = pairs
     src, ref = frame.sources[i_src], frame.reference[i_ref]
-    x_err, y_err = _position_errors(src, ref, attitude.cd)
+    x_err, y_err, reference_err = _position_errors(src, ref, attitude.cd)
     use = None if holdout is None else ~holdout[np.asarray(ref["catalog_index"])]
     return Exposure(
         name=frame.name,
@@ -380,6 +381,8 @@ def _exposure(frame, pairs, attitude, holdout):
         y=np.asarray(src["y"], float),
         x_err=x_err,
         y_err=y_err,
+        reference_err=reference_err,
+        star=np.asarray(ref["catalog_index"]),
         ra=np.asarray(ref["ra"], float),
         dec=np.asarray(ref["dec"], float),
         crval=attitude.crval,
@@ -392,17 +395,20 @@ def _exposure(frame, pairs, attitude, holdout):
 
 
 def _position_errors(src, ref, cd):
-    """Errors of pairs in px, centroid and reference star together; None where there are none."""
+    """Errors of pairs, centroid and reference star together, and the latter alone, px.
+
+    None where there are none.
+    """
     x_err, y_err = numbers_or_none(src, "x_err"), numbers_or_none(src, "y_err")
     if x_err is None or y_err is None:
-        return None, None
+        return None, None, None
     scale = np.sqrt(abs(np.linalg.det(cd))) * 3.6e6  # mas / px
     errors = [numbers_or_none(ref, name) for name in ("ra_error", "dec_error")]
     if any(e is None for e in errors):
-        return x_err, y_err
+        return x_err, y_err, None
     # Small beside those of the centroids: the mean of both axes serves at any roll.
     reference = np.sqrt(np.mean(np.nan_to_num(errors) ** 2, axis=0)) / scale
-    return np.hypot(x_err, reference), np.hypot(y_err, reference)
+    return np.hypot(x_err, reference), np.hypot(y_err, reference), reference
 
 
 def _rematch(frame, pairs, calibration, fit):
@@ -461,6 +467,8 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
             "holdout": held,
         }
     )
+    if fit.reference_offset is not None:
+        matches["ra_offset"], matches["dec_offset"] = fit.reference_offset
     for name in matches.colnames:
         matches[name].unit = _UNITS.get(name)
     # Not of use here, but to see whether residuals depend on them.
@@ -479,7 +487,7 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
         "residuals": asdict(residuals),
         "match": frame.diagnostics.to_dict(),
         "seconds": frame.seconds + seconds,
-        **{k: v for k, v in fit.statistics.items() if k == "field"},
+        **{k: v for k, v in fit.statistics.items() if k in ("field", "free_stars")},
     }
     if held.any():
         statistics["holdout"] = asdict(evaluate(fit.dx[held], fit.dy[held]))

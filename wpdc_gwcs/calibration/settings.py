@@ -65,6 +65,9 @@ class Settings:
         say.
     holdout : float, optional
         Share of the reference stars, 0 to 0.9, kept out of every fit and measured separately.
+    free_stars : bool, optional
+        Let the places of reference stars that several exposures have be unknowns, within the errors
+        of the catalog: for catalogs that are worse than the camera.
     blind : bool, optional
         Search a wide range of pointing, orientation, parity and scale for the match.
     seed : int, optional
@@ -90,6 +93,7 @@ class Settings:
     gain: float | None = None
     saturation: float | None = None
     holdout: float = 0.0
+    free_stars: bool = False
     blind: bool = False
     seed: int = 0
     method: str = "wpdc"
@@ -107,6 +111,8 @@ class Settings:
                 "refine must be auto or pv with method='paper', where every exposure has a "
                 f"polynomial of its own, got {self.refine!r}"
             )
+        if self.method == "paper" and self.free_stars:
+            raise ValueError("free_stars must be False with method='paper', which has no such step")
         if self.degree != "auto" and self.degree not in range(1, 8):
             raise ValueError(f"degree must be 'auto' or 1 to 7, got {self.degree!r}")
         if not 4 <= self.n_grid <= 1000:

@@ -114,6 +114,14 @@ def calibrate_command(
             "field where its evidence is there (auto) or always (field), or a polynomial (pv).",
         ),
     ] = "auto",
+    free_stars: Annotated[
+        bool,
+        typer.Option(
+            "--free-stars",
+            help="Places of reference stars in several exposures are unknowns, within the "
+            "catalog's errors: for catalogs worse than the camera.",
+        ),
+    ] = False,
     method: Annotated[
         str,
         typer.Option(
@@ -260,6 +268,7 @@ def calibrate_command(
             n_grid=n_grid,
             lut=lut,
             refine=refine,
+            free_stars=free_stars,
             method=method,
             degree=int(degree) if degree.isdigit() else degree,
             centroids=centroids,

@@ -19,6 +19,7 @@ from wpdc_gwcs.solve.own_polynomial import own_polynomial
 from wpdc_gwcs.solve.represent import (
     delivered_residual,
     frame_fit,
+    inherited,
     represent_detector,
     represent_frame,
 )
@@ -469,6 +470,10 @@ def _result(o, state, stored, infos, group, settings, cd, update):
     n_grid, lut, refine, degree = (settings[k] for k in ("n_grid", "lut", "refine", "degree"))
     pv_degree = settings["pv_degree"]
     solutions = {}
+    tables = [
+        _table_sigma(o, state, k, info, stored.get(d.name))
+        for k, (d, info) in enumerate(zip(o.detectors, infos))
+    ]
     weights = settings.pop("weight")
     del settings["pv_degree"]
     for k, detector in enumerate(o.detectors):
@@ -483,7 +488,7 @@ def _result(o, state, stored, infos, group, settings, cd, update):
             solution = represent_detector(
                 o, state, k, weight=weights[detector.name], degree=pv_degree,
                 n_grid=0 if lut == "none" else n_grid, cd=cd,
-                table_sigma=None if infos[k] is None else infos[k].sigma,
+                table_sigma=None if infos[k] is None else tables[k],
             )  # fmt: skip
         weight = weights[detector.name]
         solutions[detector.name] = replace(
@@ -503,7 +508,7 @@ def _result(o, state, stored, infos, group, settings, cd, update):
             tabled = lut != "none" or refine == "field"
             parts = represent_frame(
                 o, state, f, solution, n_grid=n_grid if tabled else 0,
-                table_sigma=_table_sigma(stored.get(solution.detector), infos[o.detector_of[f]]),
+                table_sigma=tables[o.detector_of[f]],
                 places=places,
             )  # fmt: skip
             if not tabled:
@@ -519,11 +524,12 @@ def _result(o, state, stored, infos, group, settings, cd, update):
     return SolveResult(solutions, tuple(fits), rejected, named, color)
 
 
-def _table_sigma(stored, info):
+def _table_sigma(o, state, k, info, stored):
     """Uncertainty of what stands beside the shared terms: a smoothed table, a stored solution."""
-    if info is not None:
-        return info.sigma
-    return None if stored is None else stored.table_sigma
+    if info is not None and info.sigma is not None:
+        factor = inherited(o, state, k)
+        return info.sigma * np.array([factor, factor, 1.0])[:, None, None]
+    return None if stored is None or info is not None else stored.table_sigma
 
 
 def _with_maps(o, state, group, solutions):

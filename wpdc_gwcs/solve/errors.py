@@ -12,6 +12,7 @@ __all__ = [
     "extrapolation",
     "frame_scale",
     "linear_scatter",
+    "repetition",
     "worse_scatter",
 ]
 
@@ -188,6 +189,42 @@ def extrapolation(stars, places):
     spacing = 2.0 / np.sqrt(min(n, _ENOUGH_STARS))
     distance, _ = cKDTree(stars.T).query(places.T)
     return 1.0 + _GROWTH * np.clip(distance / spacing - 1.0, 0.0, _FARTHEST)
+
+
+def repetition(star, variance, reference):
+    """Factor of the variance of what exposures share, for reference stars that they share, too.
+
+    Parameters
+    ----------
+    star : (N,) ndarray of int
+        Number of the star of each pair; -1 where it is unknown.
+    variance : (N,) ndarray
+        Variances of the pairs, which were fitted as if all errors were independent.
+    reference : (N,) ndarray
+        Share of the reference stars in them.
+
+    Returns
+    -------
+    float
+        1 where no star is there twice or references have no errors; at most the number of times
+        that stars are there.
+
+    Notes
+    -----
+    Whatever is the same in all exposures learns from a star of n pairs no more than the mean of
+    them tells, whose variance is that of the reference, and a share of 1/n of the others'.
+    """
+    if not len(star):
+        return 1.0
+    _, number = np.unique(star, return_inverse=True)
+    # Unknown stars are stars of their own.
+    alone = star < 0
+    number[alone] = number.max() + 1 + np.arange(np.count_nonzero(alone))
+    centroid = np.bincount(number, 1.0 / np.maximum(variance * (1.0 - reference), 1e-300))
+    shared = np.bincount(number, variance * reference) / np.maximum(np.bincount(number), 1)
+    known = centroid > 0
+    told = np.sum(1.0 / (shared[known] + 1.0 / centroid[known]))
+    return float(max(np.sum(1.0 / variance) / told, 1.0))
 
 
 def linear_scatter(b, covariance):

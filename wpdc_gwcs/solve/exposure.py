@@ -30,6 +30,10 @@ class Exposure:
     x_err, y_err : (N,) array_like, optional
         Total 1-sigma errors (centroid and reference), px; estimated from the residuals if not
         given.
+    reference_err : (N,) array_like, optional
+        Share of the reference positions in these errors, px; 0 if not given.
+    star : (N,) array_like of int, optional
+        Which star each pair is of, 0 or more: the same number in every exposure that has it.
     use : (N,) array_like of bool, optional
         Stars that may be fitted; the others (held out) only get residuals.
     color : (N,) array_like, optional
@@ -49,6 +53,8 @@ class Exposure:
     cd: np.ndarray
     x_err: np.ndarray | None = None
     y_err: np.ndarray | None = None
+    reference_err: np.ndarray | None = None
+    star: np.ndarray | None = None
     use: np.ndarray | None = None
     color: np.ndarray | None = None
     detector: str = ""
@@ -86,6 +92,8 @@ class ExposureFit:
         based; the polynomial is then in the matrix ``cd``.
     color_shift : (2, 3) ndarray or None
         Displacement of stars per magnitude of color in undistorted px: constant and linear part.
+    reference_offset : (2, N) ndarray or None
+        Where free reference stars were found to the east and to the north of the catalog, mas.
     reason : str or None
         Why the exposure was left out; its numbers are then the starting values.
     statistics : dict
@@ -105,6 +113,7 @@ class ExposureFit:
     pv: "PVPolynomial | None" = None
     crpix: np.ndarray | None = None
     color_shift: np.ndarray | None = None
+    reference_offset: np.ndarray | None = None
     reason: str | None = None
     statistics: dict = dataclasses.field(default_factory=dict)
 

@@ -97,6 +97,10 @@ class Observations:
         Pixels and reference positions in degrees.
     sigma : (2, N) ndarray
         Stated errors in px; 1 where there are none.
+    reference : (N,) ndarray
+        Share of the reference stars in the variances, 0 to 1.
+    star : (N,) ndarray of int
+        Number of the star; -1 where it is unknown.
     has_errors, valid, finite : (N,) ndarray of bool
         Errors were stated; the pair may be fitted; it gets a residual.
     color : (N,) ndarray
@@ -115,6 +119,8 @@ class Observations:
     ra: np.ndarray
     dec: np.ndarray
     sigma: np.ndarray
+    reference: np.ndarray
+    star: np.ndarray
     has_errors: np.ndarray
     valid: np.ndarray
     finite: np.ndarray
@@ -181,7 +187,8 @@ def gather(frames, shapes, crpix):
     edges = np.concatenate([[0], np.cumsum([np.size(f.x) for f in frames])])
     slices = tuple(slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:]))
     n = int(edges[-1])
-    columns = {name: np.full(n, np.nan) for name in ("x", "y", "ra", "dec", "color")}
+    wanted = ("x", "y", "ra", "dec", "color", "reference_err", "star")
+    columns = {name: np.full(n, np.nan) for name in wanted}
     stated = np.full((2, n), np.nan)
     has_errors, valid, inside = np.zeros(n, bool), np.ones(n, bool), np.zeros(n, bool)
     for frame, s, d in zip(frames, slices, detector_of):
@@ -216,7 +223,9 @@ def gather(frames, shapes, crpix):
             f"{int(bad_error.sum())} have errors that are NaN, infinite or not positive, "
             f"{n - allowed} are held out"
         )
-    color = columns.pop("color")
+    color, reference_err, star = (columns.pop(c) for c in ("color", "reference_err", "star"))
+    sigma = np.where(has_errors & good_error, stated, 1.0)
+    share = reference_err**2 / np.mean(sigma**2, axis=0)
     known = np.isfinite(color)
     # Half of the stars must tell their color before it is worth a term.
     reference_color = float(np.median(color[known & valid])) if _mostly(known, valid) else np.nan
@@ -228,7 +237,9 @@ def gather(frames, shapes, crpix):
         detector_of=detector_of,
         exposure_of=exposure_of,
         **columns,
-        sigma=np.where(has_errors & good_error, stated, 1.0),
+        sigma=sigma,
+        reference=np.where(share > 0, np.minimum(share, 1.0), 0.0),
+        star=np.where(star >= 0, star, -1).astype(np.int64),
         has_errors=has_errors,
         valid=valid,
         finite=finite & inside,

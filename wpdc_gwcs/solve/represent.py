@@ -7,13 +7,13 @@ import numpy as np
 from wpdc_gwcs.fitting import WPDCFitter, fit_attitude, robust_sigma
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 from wpdc_gwcs.solution import DistortionSolution, covariance_of
-from wpdc_gwcs.solve.errors import extrapolation
+from wpdc_gwcs.solve.errors import extrapolation, repetition
 from wpdc_gwcs.solve.exposure import ExposureFit
 from wpdc_gwcs.solve.geometry import mean_direction
 from wpdc_gwcs.solve.model import block, colored, undistorted
 from wpdc_gwcs.solve.state import predict_variance
 
-__all__ = ["N_SIGMA", "represent_detector", "represent_frame", "split_linear"]
+__all__ = ["N_SIGMA", "inherited", "represent_detector", "represent_frame", "split_linear"]
 
 # Points along each axis: for the fit of the attitude, and for the uncertainty of a frame.
 N_SIGMA = 17
@@ -119,14 +119,40 @@ def _instrument_sigma(o, state, frame, x, y, table_sigma):
 
 
 def _growth(o, state, k, x, y):
-    """Factors of the errors of a detector's distortion for the distance to the stars behind it."""
-    detector = o.detectors[k]
+    """Factors of the errors of a detector's distortion.
+
+    For the distance to the stars behind it, and for what all exposures inherit from these stars.
+    """
+    detector, behind = o.detectors[k], _behind(o, state, k)
+    stars = detector.normalized(o.x[behind], o.y[behind])
+    far = extrapolation(np.array(stars), np.array(detector.normalized(x, y)))
+    return inherited(o, state, k) * far
+
+
+def inherited(o, state, k):
+    """Factor of the errors of a detector's distortion for those of stars that exposures share.
+
+    Parameters
+    ----------
+    o : Observations
+        Pairs.
+    state : State
+        Solved state.
+    k : int
+        Number of the detector.
+    """
+    behind = _behind(o, state, k)
+    variance = np.mean(state.sigma[:, behind] ** 2, axis=0)
+    return np.sqrt(repetition(o.star[behind], variance, o.reference[behind]))
+
+
+def _behind(o, state, k):
+    """Mark the pairs that a detector's distortion was learnt from."""
     behind = np.zeros(len(o), bool)
     for f in state.active:
         if o.detector_of[f] == k:
             behind[o.slices[f]] = state.kept[o.slices[f]]
-    stars = detector.normalized(o.x[behind], o.y[behind])
-    return extrapolation(np.array(stars), np.array(detector.normalized(x, y)))
+    return behind
 
 
 def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places):
