@@ -6,17 +6,12 @@ result, or with one line that begins ``wpdc: error:``; a WCS file that still ope
 same positions.  Run as ``python benchmarks/fuzz.py [CASES] [SEED]``.
 """
 
-import bz2
 import contextlib
 import faulthandler
-import gzip
 import io
-import lzma
 import os
-import re
 import shutil
 import signal
-import socket
 import sys
 import tempfile
 import time
@@ -26,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import Table
+from damage import DAMAGE, MAKE, ODD, ODD_VALUES, odd_config, odd_image, odd_place, odd_table
 
 from wpdc_gwcs import read, simulate, write
 from wpdc_gwcs.calibration import calibrate
@@ -37,10 +32,6 @@ from wpdc_gwcs.simulation import write_simulation
 LONGEST = 20.0  # s of this process, whatever else the machine does
 SCALE = 0.3  # arcsec / px
 SAME = 1e-9  # px, what a WCS may be off by where the file is still accepted
-ODD_VALUES = ["nan", "inf", "-inf", "1e400", "1e30", "-1e30", "0", "-1", "1e-300", "''", "null",
-              "true", "[]", "{}", "abc", "9" * 20, "1e23", "0x7f", "é", "~", "*"]  # fmt: skip
-ODD_CARDS = ["1E30", "-1E30", "NaN", "'text'", "0.0", "T", "1.2.3", "", "1E400", "'unclosed",
-             "(1.0, 2.0)", "99999999999999999999", "-5", "1E-300", "\x00\x01"]  # fmt: skip
 OPTIONS = {
     "--seed": ["-1", "1e23", "99999999999999999999999", "x", ""],
     "--r0": ["nan", "inf", "0", "-1", "1e-300", "1e300"],
@@ -66,6 +57,23 @@ OPTIONS = {
     "--solution": ["", ".", "/dev/null"],
     "--wcs": ["", ".", "/dev/null"],
 }
+# What else reads a file of a kind.
+_CONVERT = "convert {path} --to {form} --output {work}/new.fits"
+OTHERS = {
+    "wcs": [_CONVERT, "export {path} --format {form} --output {work}/new.fits",
+            "export {path} --into {image} --output {work}/new.fits", "sky2pix {path} 120.0 30.0"],
+    "fits": [_CONVERT, "sky2pix {path} 120.0 30.0"],
+    "cpdis": [_CONVERT],
+    "solution": ["export {path} --format {form} --output {work}/new.fits",
+                 "monitor {path} {matches}", "calibrate {ldac} --catalog {catalog} --solution "
+                 "{path} --update --output {work}/new"],
+    "header": [_CONVERT, "match {table} --wcs {path} --catalog {catalog} --output {work}/new.ecsv"],
+    "image": [_CONVERT, "detect {path} --output {work}/new.ecsv"],
+    "table": ["match {path} --wcs {header} --catalog {catalog} --output {work}/new.ecsv",
+              "pix2sky {wcs} {path}"],
+    "catalog": ["match {ldac} --catalog {path} --output {work}/new.ecsv", "sky2pix {wcs} {path}"],
+    "matches": ["monitor {solution} {path}", "report {folder} --overwrite"],
+}  # fmt: skip
 
 
 class Hang(BaseException):
@@ -85,7 +93,18 @@ def make_inputs(folder):
     wcs = folder / "out" / f"{calibration.frame}.wcs.asdf"
     write(calibration, folder / "a.fits")
     write(calibration, folder / "a.cpdis.fits", format="cpdis")
+    pair = write_simulation(
+        simulate(2, image_shape=(256, 256), density=200, distortion=3, seed=2),
+        folder / "pair", images=(0, 1),
+    )  # fmt: skip
+    for path, detector in zip(pair["frames"], "ab", strict=True):
+        fits.setval(path, "DETECTOR", value=detector)
+        fits.setval(path, "INSTRUME", value="cam")
+        fits.setval(path, "EXPNUM", value=1)
+    frames = [frame for path in pair["frames"] for frame in read_frames(path)]
+    calibrate(frames, pair["reference"], output=folder / "mosaic")
     return {
+        "mosaic": folder / "mosaic", "camera": next((folder / "mosaic").glob("*.camera.asdf")),
         "image": image, "ldac": ldac, "table": table, "header": folder / "start.hdr",
         "catalog": files["reference"], "wcs": wcs, "fits": folder / "a.fits",
         "cpdis": folder / "a.cpdis.fits",
@@ -96,232 +115,13 @@ def make_inputs(folder):
     }  # fmt: skip
 
 
-# --- damage -------------------------------------------------------------------------------------
-
-
-def flip(data, rng):
-    data = bytearray(data)
-    for bit in rng.integers(8 * len(data), size=rng.choice([1, 1, 1, 5])):
-        data[bit // 8] ^= 1 << (bit % 8)
-    return bytes(data)
-
-
-def cut(data, rng):
-    return data[: int(rng.integers(len(data)))]
-
-
-def put_in(data, rng):
-    at = int(rng.integers(len(data)))
-    return data[:at] + rng.bytes(int(rng.integers(1, 50))) + data[at:]
-
-
-def take_out(data, rng):
-    at = int(rng.integers(len(data)))
-    return data[:at] + data[at + int(rng.integers(1, 200)) :]
-
-
-def double(data, rng):
-    a, b = sorted(int(i) for i in rng.integers(len(data), size=2))
-    return data[:b] + data[a : min(b, a + 3000)] + data[b:]
-
-
-def blank(data, rng):
-    at, n = int(rng.integers(len(data))), int(rng.integers(1, 500))
-    return data[:at] + bytes(min(n, len(data) - at)) + data[at + n :]
-
-
-def other_value(data, rng):
-    """Another value for one of the numbers in the text of a file."""
-    places = list(re.finditer(rb"(?<=[\s:,\[\"])-?\d+(\.\d+)?([eE][-+]?\d+)?", data[:40000]))
-    if not places:
-        return flip(data, rng)
-    place = places[int(rng.integers(len(places)))]
-    value = str(rng.choice(ODD_VALUES)).encode()
-    return data[: place.start()] + value + data[place.end() :]
-
-
-def other_line(data, rng):
-    """A line that is missing, twice there, or has a name that is spelt otherwise."""
-    lines = data.split(b"\n")
-    k = int(rng.integers(min(len(lines), 300)))
-    how = rng.integers(4)
-    if how == 0:
-        del lines[k]
-    elif how == 1:
-        lines.insert(k, lines[k])
-    elif how == 2:
-        lines[k] = lines[k].replace(b"a", b"e", 1)
-    else:
-        lines[k] = b" " + lines[k]
-    return b"\n".join(lines)
-
-
-def other_card(data, rng):
-    """Another value for one of the cards of a FITS header."""
-    starts = [i for i in range(0, min(len(data), 28800), 80) if data[i + 8 : i + 10] == b"= "]
-    if not starts:
-        return flip(data, rng)
-    wcs = [i for i in starts if re.match(rb"C(TYPE|RVAL|RPIX|D|UNIT)|NAXIS|BITPIX|PV", data[i:])]
-    i = int(rng.choice(wcs if wcs and rng.uniform() < 0.7 else starts))
-    value = str(rng.choice(ODD_CARDS)).encode("latin-1")
-    return data[: i + 10] + value.rjust(20).ljust(70)[:70] + data[i + 80 :]
-
-
-def other_bytes(data, rng):
-    """Nothing, noise, or the beginning of something else."""
-    starts = [b"", b"\0" * 5000, b"#ASDF 1.0.0\n%YAML 1.1\n--- \n", b"SIMPLE  =", b"\x1f\x8b",
-              b"BZh9", b"%PDF-1.5", b"<?xml version='1.0'?><VOTABLE>", b"\xff\xfe",
-              b"# %ECSV 1.0\n",
-              b"SIMPLE  =                    T".ljust(80) * 40]  # fmt: skip
-    return starts[int(rng.integers(len(starts)))] + rng.bytes(int(rng.integers(0, 4000)))
-
-
-ANY = [flip, cut, put_in, take_out, double, blank, other_bytes]
-DAMAGE = {
-    "wcs": [*ANY, other_value, other_value, other_line, other_line],
-    "solution": [*ANY, other_value, other_line],
-    "fits": [*ANY, other_card, other_card],
-    "cpdis": [*ANY, other_card],
-    "image": [*ANY, other_card, other_card, other_card],
-    "ldac": [*ANY, other_card],
-    "table": [*ANY, other_value, other_line],
-    "header": [*ANY, other_line, other_card],
-    "catalog": [*ANY, other_card, other_card],
-    "matches": [*ANY, other_value, other_line],
-    "summary": [*ANY, other_value, other_line],
-    "manifest": [*ANY, other_value, other_line],
-}
-
-
-def odd_image(path, rng):
-    """Images that are no sky: sizes, values and types."""
-    shape = [(1, 1), (1, 300), (0, 5), (3, 3), (2, 64, 64), (64,), (64, 64)][int(rng.integers(7))]
-    values = [0.0, np.nan, np.inf, 1e38, -1e30, 5.0][int(rng.integers(6))]
-    data = np.full(shape, values, [np.float32, np.float64][int(rng.integers(2))])
-    if rng.uniform() < 0.3:
-        data = rng.integers(-30000, 30000, shape).astype(np.int16)
-    header = fits.getheader(path)
-    fits.writeto(path, data, header, overwrite=True, output_verify="ignore")
-
-
-def odd_table(path, rng):
-    """Catalogs with values that are none."""
-    table = Table.read(path)
-    name = str(rng.choice(table.colnames))
-    odd = [np.nan, np.inf, -1e308, 1e5, 0.0, -91.0][int(rng.integers(6))]
-    rows = rng.uniform(size=len(table)) < rng.choice([0.1, 1.0])
-    how = int(rng.integers(4))
-    if how == 0:
-        table[name] = np.where(rows, odd, np.asarray(table[name], float))
-    elif how == 1:
-        table.remove_column(name)
-    elif how == 2:
-        table[name] = np.array(["text"] * len(table))
-    else:
-        table = table[: int(rng.integers(0, 4))]
-    table.write(path, overwrite=True)
-
-
-# What nobody means, by what it is made of.
-ODD = {
-    "place": ["image", "table", "catalog", "header", "wcs", "fits", "solution", "config", "mask",
-              "weight-map"],
-    "archive": ["image", "catalog", "fits"],
-    "tree": ["wcs", "solution"],
-    "list": ["table"],
-}  # fmt: skip
-
-
-def odd_place(folder, name, rng):
-    """What is there and is no file of the kind: a folder, a pipe, a device, a link to itself."""
-    path = folder / f"odd-{name}.fits"
-    kind = str(rng.choice(["folder", "pipe", "socket", "loop", "nothing", "device", "endless"]))
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "socket":
-        with contextlib.closing(socket.socket(socket.AF_UNIX)) as server:
-            server.bind(os.path.relpath(path))
-    elif kind in ("loop", "nothing"):
-        path.symlink_to(path if kind == "loop" else folder / "nothing")
-    else:
-        return Path("/dev/null" if kind == "device" else "/dev/zero")
-    return path
-
-
-def odd_archive(data, rng):
-    """Compressed once or twice, cut, with a wrong sum, or far larger than it looks."""
-    packed = gzip.compress(data)
-    return [
-        packed[: int(rng.integers(1, len(packed)))],
-        packed + b"more" * 100,
-        packed[:-8] + bytes(8),
-        gzip.compress(packed),
-        gzip.compress(b""),
-        gzip.compress(data[:5760] + bytes(100_000_000)),
-        bz2.compress(data)[: int(rng.integers(1, 5000))],
-        lzma.compress(data)[: int(rng.integers(1, 5000))],
-    ][int(rng.integers(8))]
-
-
-def odd_tree(data, rng):
-    """ASDF with tags, types, shapes and sources that are other ones."""
-    head, tree = data[: (at := data.index(b"\nwpdc:"))], data[at:]
-    old, new = [
-        (rb"datatype: float64", b"datatype: complex128"),
-        (rb"datatype: float64", b"datatype: [ascii, 9]"),
-        (rb"byteorder: little", b"byteorder: big"),
-        (rb"source: \d+", b"source: 99"),
-        (rb"source: \d+", b"source: -9"),
-        (rb"source: \d+", b"source: other.asdf"),
-        (rb"shape: \[\d+", b"shape: [-5"),
-        (rb"shape: \[\d+", b"shape: [999999999999"),
-        (rb"!core/ndarray-1.\d.0", b"!core/complex-1.0.0"),
-        (rb"!core/ndarray-1.\d.0", b"!!python/object/apply:os.system"),
-        (rb"\nwpdc:", b"\nwpdc: &w {wpdc: *w}\nother:"),
-        (rb"\nwpdc:", b"\nwpdc: {$ref: 'http://127.0.0.1:9/a'}\nother:"),
-        (rb"format_version: 1", b"format_version: 0"),
-    ][int(rng.integers(13))]
-    return head + re.sub(old, new, tree, count=1)
-
-
-def odd_config(rng):
-    """TOML that is none, or whose values are of other types."""
-    return [
-        b"r0 = [1, 2]", b"[r0]\na = 1", b"seed = 2020-01-01", b"seed = true", b"jobs = '2'",
-        b"a = " + b"[" * 3000, b"a = " + b"[" * 200 + b"]" * 200, b"seed = 1\nseed = 2",
-        b"\xff\xfe", b"\xef\xbb\xbfseed = 1", b"seed = " + b"9" * 5000, b"output = 5",
-        b"n-grid = 50.5", b"a.b.c = 1", b"mask-bits = 'x'", b"x = '" + b"a" * 10_000_000 + b"'",
-        b'detector = "\\u0000"', b"catalog = ['a', 'b']", b"min-snr = nan", b"frames = ['x']",
-    ][int(rng.integers(20))]  # fmt: skip
-
-
-def odd_list(data, rng):
-    """ECSV whose header says what no table is."""
-    old, new = [
-        (b"ECSV 1.0", b"ECSV 9.7"), (b"float64", b"floaty"), (b"float64", b"object"),
-        (b"float64", b"complex128"), (b"name: y", b"name: x"),
-        (b"# datatype:", b"# delimiter: '@@'\n# datatype:"),
-        (b"# datatype:", b"# meta: !!omap [1, 2]\n# datatype:"),
-        (b"# datatype:", b"# meta: !!python/object/apply:os.system [x]\n# datatype:"),
-        (b"# datatype:", b"# meta: " + b"[" * 5000 + b"\n# datatype:"),
-        (b"# datatype:", b"# meta: {__serialized_columns__: 5}\n# datatype:"),
-        (b"# -", b"#\t-"),
-    ][int(rng.integers(11))]  # fmt: skip
-    return data.replace(old, new) if rng.uniform() < 0.9 else data + b"1" * 10_000_000
-
-
-MAKE = {"archive": odd_archive, "tree": odd_tree, "list": odd_list}
-
-
 # --- cases --------------------------------------------------------------------------------------
 
 
 def cases(inputs, work, n, seed):
     """Kind, command, and whether its output must stay as it was."""
     rng = np.random.default_rng(seed)
-    kinds = [*DAMAGE, "odd image", "odd catalog", "option", "config", *ODD]
+    kinds = [*DAMAGE, "odd image", "odd catalog", "option", "config", *ODD, "into", "commands"]
     weights = np.array([3.0 if kind in ("wcs", "fits") else 1.0 for kind in kinds])
     for _ in range(n):
         kind = str(rng.choice(kinds, p=weights / weights.sum()))
@@ -332,10 +132,17 @@ def cases(inputs, work, n, seed):
             copies[name] = work / path.name
             (shutil.copytree if path.is_dir() else shutil.copy)(path, copies[name])
         inside = {n: copies["folder"] / inputs[n].name for n in ("matches", "summary", "manifest")}
+        inside["camera"] = copies["mosaic"] / inputs["camera"].name
         if kind in DAMAGE:
             path = inside.get(kind, copies.get(kind))
             damage = DAMAGE[kind][int(rng.integers(len(DAMAGE[kind])))]
             path.write_bytes(damage(path.read_bytes(), rng))
+        elif kind in ("into", "commands"):
+            of = "image" if kind == "into" else str(rng.choice(list(OTHERS)))
+            path = inside.get(of, copies.get(of))
+            damage = DAMAGE[of][int(rng.integers(len(DAMAGE[of])))]
+            path.write_bytes(damage(path.read_bytes(), rng))
+            form = str(rng.choice(["tpv", "sip", "cpdis", "fits", "tab"]))
         elif kind == "odd image":
             odd_image(copies["image"], rng)
         elif kind == "odd catalog":
@@ -353,7 +160,17 @@ def cases(inputs, work, n, seed):
         }
         frame = copies["ldac"]
         keeps = False
-        if kind in ODD:
+        if kind == "into":
+            command = ["export", inputs["wcs"], "--into", copies["image"], "--format", form]
+            command += ["--output", work / "copy.fits"]
+        elif kind == "commands":
+            command = [
+                str(word).format(
+                    path=path, work=work, form=form, **{**inputs, "folder": copies["folder"]}
+                )
+                for word in OTHERS[of][int(rng.integers(len(OTHERS[of])))].split()
+            ]
+        elif kind in ODD:
             # The damaged file is asked for by what reads such files.
             frame = copies[of] if of in ("image", "table") else frame
             options |= {f"--{of}": copies[of]} if of in ("catalog", "solution", "config") else {}
@@ -364,6 +181,9 @@ def cases(inputs, work, n, seed):
             command = ["calibrate", frame]
             if of in ("wcs", "fits"):
                 command, keeps = ["pix2sky", copies[of], "100.25", "71.5"], True
+        elif kind == "camera":
+            command = ["calibrate", inputs["ldac"]]
+            options["--solution"] = inside["camera"]
         elif kind in ("wcs", "fits", "cpdis", "solution"):
             command, keeps = ["pix2sky", copies[kind], "100.25", "71.5"], True
         elif kind == "matches":

@@ -3,7 +3,8 @@
 Each trial calibrates the same frames again with ``--overwrite``, is sent SIGKILL, SIGTERM or Ctrl-C
 at a random moment, and is then completed by ``--resume``.  Before and after, all sets of files must
 be whole and of one run, nothing may be lost, no process may live on, and the numbers must be those
-of a run that was never stopped.  Run as ``python benchmarks/stops.py [TRIALS]``.
+of a run that was never stopped.  Signals go to the program alone or, as of a terminal and of batch
+systems, to its processes all at once.  Run as ``python benchmarks/stops.py [TRIALS] [SEED]``.
 """
 
 import os
@@ -70,7 +71,7 @@ def numbers_of(folder):
 
 def main():
     trials = int(sys.argv[1]) if len(sys.argv) > 1 else 30
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(int(sys.argv[2]) if len(sys.argv) > 2 else 1)
     work = Path(tempfile.mkdtemp())
     frames, reference = make_inputs(work / "in")
     arguments = [*map(str, frames), "--catalog", str(reference), "--jobs", "2"]
@@ -92,7 +93,8 @@ def main():
             time.sleep(rng.uniform(0.2, 1.05) * duration)
             if process.poll() is None:
                 moments[number.name] += 1
-                stop = os.killpg if number == signal.SIGINT else os.kill
+                to_all = number == signal.SIGINT or rng.uniform() < 0.5
+                stop = os.killpg if to_all else os.kill
                 stop(process.pid, number)
             stopped = time.perf_counter()
             errors = process.communicate()[1]

@@ -269,8 +269,8 @@ def into_images(obj):
                     if reproject_interp:
                         values, _ = reproject_interp(path, target, shape_out=thinned, hdu_in=number)
                         found.append(errors_of(values[v, u], place, axis, shape))
-                    if kind == "plain" and form == "tpv" and shutil.which("SWarp"):
-                        values, sky = run_swarp(Path(folder), "a.fits")
+                    if form == "tpv" and shutil.which("SWarp"):
+                        values, sky = run_swarp(Path(folder), f"a.fits[{number}]")
                         at = np.array(obj.wcs.invert(*sky))
                         swarp.append(errors_of(values, at, axis, shape))
             cells = [made.deviation, greatest(found), made.swarp_deviation, greatest(swarp)]

@@ -8,8 +8,7 @@ Run from the root of the project::
 A row says ``same`` where both give the same numbers, ``better`` where ours works and stock does
 not, ``WORSE`` where stock works and ours does not.  Packages (PyPI): reproject, drizzle,
 matplotlib, photutils, ndcube, stcal, tweakwcs, dask.  The last rows write files as the pipelines of
-JWST and Roman do, and convert them.  One test of gwcs fails with our class: it asks for the name of
-theirs.
+JWST and Roman do, and convert them.
 """
 
 import argparse

@@ -66,6 +66,52 @@ def test_nodes_of_a_table_are_read_only():
     assert table(1.0, 1.0) == (1.0, 1.0)
 
 
+def a_calibration():
+    grid = np.linspace(-0.5, 9.5, 4)
+    table = LookupTable(grid, grid, *np.ones((2, 4, 4)))
+    solution = DistortionSolution(
+        "a", (10, 10), [5, 5], 1e-4 * np.eye(2), [1, 2], PVPolynomial(), lookup_table=table
+    )
+    return Calibration("f", solution, crval=[1, 2], cd=1e-4 * np.eye(2), field=table)
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        lambda c: c, copy.copy, copy.deepcopy, dataclasses.replace,
+        lambda c: pickle.loads(pickle.dumps(c)),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: setattr(c.solution.pv, "pv1_0", 1.0),
+        lambda c: setattr(c.solution.pv.pv2_7, "value", 1.0),
+        lambda c: setattr(c.solution.pv, "parameters", np.zeros(20)),
+        lambda c: setattr(c.solution.lookup_table, "displacement", np.zeros((2, 4, 4))),
+        lambda c: setattr(c.field, "displacement", np.zeros((2, 4, 4))),
+    ],
+)
+def test_models_of_results_cannot_be_changed(way, change):
+    calibration = way(a_calibration())
+    before = calibration.wcs(3.0, 4.0)
+    with pytest.raises(TypeError, match="belongs to a result, which cannot be changed"):
+        change(calibration)
+    assert calibration.wcs(3.0, 4.0) == before
+
+
+def test_models_are_the_results_own():
+    calibration, given = a_calibration(), PVPolynomial()
+    solution = dataclasses.replace(calibration.solution, pv=given)
+    given.pv1_0 = 5.0
+    assert solution.pv.pv1_0 == 0.0
+    # Those of others can be changed, and copies, as a fitter makes them.
+    for model in (solution.pv.copy(), copy.deepcopy(solution.pv)):
+        model.pv1_0 = 5.0
+        assert model(0.0, 0.0)[0] == 5.0
+    assert solution.pv(0.0, 0.0)[0] == 0.0
+
+
 def test_it_is_a_dictionary():
     frozen = freeze({"a": {"b": [1, 2]}})
     assert json.loads(json.dumps(frozen)) == {"a": {"b": [1, 2]}}

@@ -272,6 +272,49 @@ def test_what_is_refused(tmp_path, calibration, image):
         write_into(calibration, plain, alternates="drop")
 
 
+@pytest.mark.parametrize("name", [None, "PRIMARY", "ONE", "TWO"])
+def test_only_tables_of_the_wcs_go(tmp_path, calibration, image, name):
+    """A -TAB that names no table, or what is none, takes nothing with it."""
+    path = tmp_path / "a.fits"
+    header = fits.Header({"CTYPE1": "RA---TAB", "CTYPE2": "DEC--TAB"})
+    if name is not None:
+        header["PS1_0"] = header["PS2_0"] = name
+    column = fits.Column("A", "D", array=np.arange(5.0))
+    hdus = [fits.PrimaryHDU(image), fits.ImageHDU(image, header, name="ONE")]
+    hdus += [fits.ImageHDU(image, name="TWO"), fits.BinTableHDU.from_columns([column])]
+    fits.HDUList(hdus).writeto(path)
+    before = hdu_bytes(path)
+    write_into(calibration, f"{path}[1]")
+    after = hdu_bytes(path)
+    assert [k for k in range(4) if before[k] != after[k]] == [1]
+    assert after[1][1] == before[1][1]
+
+
+@pytest.mark.parametrize("value", ["''", "'abc'", "'a longer one than any'", "0", "", "'0' / x'y'"])
+def test_checksums_of_other_forms(tmp_path, calibration, image, value):
+    """Whatever stood there, what stands there then is the sum."""
+    path = tmp_path / "a.fits"
+    write_plain(path, image, old_header(), checksum=True)
+    data = path.read_bytes()
+    at = data.index(b"CHECKSUM=")
+    path.write_bytes(data[:at] + f"CHECKSUM= {value}".ljust(80).encode() + data[at + 80 :])
+    write_into(calibration, path)
+    with fits.open(path, checksum=True) as hdus:  # warnings are errors
+        assert hdus[0].verify_checksum() == 1
+        assert len(hdus[0].header["CHECKSUM"]) == 16
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="asks for root")
+def test_the_owner_stays(tmp_path, calibration, image):
+    path = tmp_path / "a.fits"
+    write_plain(path, image, old_header())
+    os.chown(path, 1234, 2345)
+    os.chmod(path, 0o2640)
+    write_into(calibration, path)
+    state = path.stat()
+    assert (state.st_uid, state.st_gid, state.st_mode & 0o7777) == (1234, 2345, 0o2640)
+
+
 def test_cards_that_nobody_knows_are_found_out(tmp_path, calibration, image, monkeypatch):
     """The file is read back: if a term of the old WCS stayed, nothing is written."""
     path = tmp_path / "a.fits"

@@ -596,6 +596,7 @@ def test_a_full_disk_leaves_nothing(inputs, tmp_path):
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 2
+    assert f"{out}/sim-" in done.stderr
     assert "cannot be written: File too large" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert list(out.iterdir()) == []

@@ -14,6 +14,7 @@ from astropy.modeling.models import Scale, Shift
 from astropy.utils.masked import Masked
 from astropy.wcs import WCS
 from astropy.wcs.wcsapi import HighLevelWCSWrapper, SlicedLowLevelWCS
+from astropy.wcs.wcsapi.utils import wcs_info_str
 from gwcs import coordinate_frames as cf
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -372,6 +373,17 @@ def test_masked_arrays_keep_their_mask(box):
     ra, dec = wcs(Masked(x * u.pix, mask=mask), y * u.pix)
     assert ra.mask.tolist() == dec.mask.tolist() == mask.tolist()
     assert_allclose(ra[0].unmasked.to_value(u.deg), expected[0][0])
+
+
+def test_it_is_described_as_that_of_gwcs():
+    """astropy writes the name of the class; a test of gwcs compares it."""
+    wcs = camera_wcs()
+    words = SlicedLowLevelWCS(wcs, Ellipsis), to_stock_wcs(wcs), wcs
+    assert [str(one).splitlines()[0] for one in map(wcs_info_str, words)] == [
+        "SlicedLowLevelWCS Transformation",
+        "WCS Transformation",
+        "WCS Transformation",
+    ]
 
 
 def test_repr_shows_the_parameters():

@@ -3,8 +3,16 @@
 import copy
 
 import numpy as np
+from astropy.modeling.parameters import Parameter
 
-__all__ = ["FrozenDict", "freeze", "freeze_attributes", "frozen_array", "with_statistics"]
+__all__ = [
+    "FrozenDict",
+    "freeze",
+    "freeze_attributes",
+    "freeze_models",
+    "frozen_array",
+    "with_statistics",
+]
 
 
 class FrozenDict(dict):
@@ -24,6 +32,26 @@ class FrozenDict(dict):
 
     def __reduce__(self):
         return type(self), (dict(self),)
+
+
+class _FrozenParameter(Parameter):
+    """A parameter of a model that cannot be set; those of copies of the model can."""
+
+    @property
+    def value(self):
+        """Value of the parameter."""
+        return Parameter.value.fget(self)
+
+    @value.setter
+    def value(self, value):
+        raise TypeError(
+            f"{self.name} belongs to a result, which cannot be changed; a copy of the model can"
+        )
+
+    def __deepcopy__(self, memo):
+        new = memo[id(self)] = Parameter.__new__(Parameter)
+        new.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        return new
 
 
 def freeze(value):
@@ -104,6 +132,26 @@ def freeze_attributes(owner, *names):
     """
     for name in names:
         object.__setattr__(owner, name, freeze(getattr(owner, name)))
+
+
+def freeze_models(owner, *names):
+    """Turn models among the attributes of a frozen dataclass into ones of its own that stay.
+
+    Parameters
+    ----------
+    owner : object
+        The dataclass; attributes that are `None` are left alone.
+    *names : str
+        Names of the attributes, models of astropy whose parameters are their own.
+    """
+    for name in names:
+        model = getattr(owner, name)
+        if model is None or isinstance(getattr(model, model.param_names[0]), _FrozenParameter):
+            continue
+        model = model.copy()
+        for parameter in model.param_names:
+            model.__dict__[parameter].__class__ = _FrozenParameter
+        object.__setattr__(owner, name, model)
 
 
 def with_statistics(result, **entries):

@@ -15,7 +15,7 @@ from astropy import units as u
 from scipy.interpolate import RegularGridInterpolator
 
 from wpdc_gwcs.export.memory import InMemory
-from wpdc_gwcs.frozen import freeze_attributes, frozen_array
+from wpdc_gwcs.frozen import freeze_attributes, freeze_models, frozen_array
 from wpdc_gwcs.models import LookupTable, PVPolynomial, deproject
 from wpdc_gwcs.models.blocks import evaluate_blocks
 from wpdc_gwcs.wcs import build_wcs
@@ -106,10 +106,16 @@ class DistortionSolution(InMemory):
             object.__setattr__(self, "image_shape", shape)
         if not np.isfinite(self.pv.coefficients).all():
             raise ValueError("coefficients of the polynomial must be finite")
+        freeze_models(self, "pv", "lookup_table")
         for name in ("valid_from", "valid_to"):
             epoch = getattr(self, name)
             if epoch is not None and not np.isfinite(epoch):
                 raise ValueError(f"{name} must be a Julian year or None, got {epoch}")
+
+    def __setstate__(self, state):
+        # Copies of models can be changed, those in copies of results cannot.
+        self.__dict__.update(state)
+        freeze_models(self, "pv", "lookup_table")
 
     def holds_at(self, epoch):
         """Tell whether the solution is valid at an epoch.
@@ -282,10 +288,15 @@ class Calibration(InMemory):
         _freeze_sigma(self, "sigma")
         frozen_array(self, "color_shift", shape=(2, 3))
         freeze_attributes(self, "statistics", "settings", "provenance")
+        freeze_models(self, "field")
 
     def __getstate__(self):
         # Functions of compiled code stay where they are; they are made again where they are needed.
         return {name: value for name, value in self.__dict__.items() if name != "_functions"}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state)
+        freeze_models(self, "field")
 
     @cached_property
     def wcs(self):

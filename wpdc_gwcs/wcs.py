@@ -209,6 +209,10 @@ class DetectorWCS(WCS):
         return tuple(values)
 
 
+# `str` and `repr` of a WCS call it what they call that of gwcs, also where astropy writes them.
+DetectorWCS.__name__ = WCS.__name__
+
+
 def _evaluate(function, args, input_frame, output_frame):
     """Evaluate a function of blocks for arguments with units or without; scalars become floats."""
     with_units = any(isinstance(value, u.Quantity) for value in args)

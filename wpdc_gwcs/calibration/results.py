@@ -344,6 +344,9 @@ class ResultFolder:
                 if path.name != REMOVED:
                     self._require_free(path.name)
             part.rename(part.with_suffix(".done"))
+        except InputError as err:
+            # Nobody knows the hidden folder, which is gone by then.
+            raise InputError(str(err).replace(str(part), str(self.folder))) from err
         except OSError as err:
             raise InputError(f"{self.folder}: cannot be written to: {err.strerror or err}") from err
         self._manifest, self._rows = manifest, rows

@@ -21,7 +21,7 @@ class SipFit(NamedTuple):
     terms: np.ndarray
 
 
-def fit_sip(pixels, plane, degree):
+def fit_sip(pixels, plane, degree, weights=None):
     """Fit CRPIX, CD and the SIP polynomials of one degree.
 
     Parameters
@@ -32,6 +32,8 @@ def fit_sip(pixels, plane, degree):
         Tangent-plane coordinates of these, deg.
     degree : int
         Degree, 2 or more.
+    weights : (N,) ndarray, optional
+        Of the squares of the errors; all the same by default.
 
     Returns
     -------
@@ -46,10 +48,11 @@ def fit_sip(pixels, plane, degree):
     """
     center = pixels.mean(axis=1)
     scale = np.abs(pixels - center[:, np.newaxis]).max()
-    terms = _fit_terms(*(pixels - center[:, np.newaxis]), plane, scale, degree, least=0)
+    u = pixels - center[:, np.newaxis]
+    terms = _fit_terms(*u, plane, scale, degree, least=0, weights=weights)
     crpix = center + _root(terms)
     u = pixels - crpix[:, np.newaxis]
-    terms = _fit_terms(*u, plane, scale, degree, least=1)
+    terms = _fit_terms(*u, plane, scale, degree, least=1, weights=weights)
     cd = np.column_stack([terms[:, 1, 0], terms[:, 0, 1]])
     return SipFit(crpix, cd, np.einsum("ij,jpq->ipq", np.linalg.inv(cd), terms))
 
@@ -80,12 +83,13 @@ def fit_sip_inverse(sip, pixels, plane, degree):
     return terms, float(np.hypot(*(back - u)).max())
 
 
-def _fit_terms(u, v, values, scale, degree, *, least):
+def _fit_terms(u, v, values, scale, degree, *, least, weights=None):
     """Fit coefficients [axis, p, q] of u^p v^q with least <= p + q <= degree."""
+    root = 1.0 if weights is None else np.sqrt(weights)[:, np.newaxis]
     powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p) if p + q >= least]
     # A scaled basis keeps the powers comparable.
     design = np.column_stack([(u / scale) ** p * (v / scale) ** q for p, q in powers])
-    solution = np.linalg.lstsq(design, values.T, rcond=None)[0]
+    solution = np.linalg.lstsq(design * root, values.T * root, rcond=None)[0]
     terms = np.zeros((2, degree + 1, degree + 1))
     for (p, q), value in zip(powers, solution, strict=True):
         terms[:, p, q] = value / scale ** (p + q)

@@ -5,6 +5,7 @@ import numpy as np
 from wpdc_gwcs.export._sip_fit import fit_sip, fit_sip_inverse
 from wpdc_gwcs.export.cards import linear_cards, number_card
 from wpdc_gwcs.export.exact import astropy_sky, description, deviation, sample_plane
+from wpdc_gwcs.export.levelling import levelling_weights
 
 __all__ = ["sip_keywords"]
 
@@ -51,10 +52,12 @@ def sip_keywords(obj, degree=None):
     pixels, plane = sample_plane(obj)
     trials = []
     for n in _DEGREES if degree is None else [degree]:
-        sip = fit_sip(pixels, plane, n)
-        trials.append((deviation(obj, astropy_sky(_keywords(obj, sip)), n=151), sip))
+        trials.append(_trial(obj, fit_sip(pixels, plane, n)))
         if trials[-1][0] < _ENOUGH_PX:
             break
+        weights = levelling_weights(pixels, np.linalg.solve(description(obj).cd, plane), n)
+        level = _trial(obj, fit_sip(pixels, plane, n, weights))
+        trials[-1] = min(trials[-1], level, key=lambda t: t[0])
     best = min(worst for worst, _ in trials)
     sip = next(sip for worst, sip in trials if worst <= _NEARLY * best)
     worst = deviation(obj, astropy_sky(_keywords(obj, sip)))
@@ -63,6 +66,10 @@ def sip_keywords(obj, degree=None):
         if inverse_worst <= max(worst, _INVERSE_PX):
             break
     return _keywords(obj, sip, inverse), worst, inverse_worst
+
+
+def _trial(obj, sip):
+    return deviation(obj, astropy_sky(_keywords(obj, sip)), n=151), sip
 
 
 def _keywords(obj, sip, inverse=None):

@@ -20,6 +20,7 @@ from wpdc_gwcs.export.exact import (
     require_shape,
     sample_plane,
 )
+from wpdc_gwcs.export.levelling import levelling_weights
 from wpdc_gwcs.export.swarp import nearer_linear_part, step_errors
 from wpdc_gwcs.models import LookupTable, PVPolynomial, pv_terms
 from wpdc_gwcs.models.attitude import fold_attitude
@@ -183,14 +184,19 @@ def nearest_polynomial(obj, degree=None):
     u = exact.cd @ (pixels - np.reshape(exact.solution.crpix, (2, 1)))
     trials = []
     for n in _DEGREES if degree is None else [degree]:
-        pv = _fit(u, plane, n)
-        trials.append((_tpv_deviation(obj, pv, n=151), pv))
+        trials.append(_trial(obj, _fit(u, plane, n)))
         if trials[-1][0] <= _ENOUGH_PX:
             break
+        weights = levelling_weights(pixels, np.linalg.solve(exact.cd, plane), n)
+        trials[-1] = min(trials[-1], _trial(obj, _fit(u, plane, n, weights)), key=lambda t: t[0])
     best = min(worst for worst, _ in trials)
     limit = max(_NEARLY * best, _ENOUGH_PX)
     pv = next(pv for worst, pv in trials if worst <= limit)
     return pv, _tpv_deviation(obj, pv)
+
+
+def _trial(obj, pv):
+    return _tpv_deviation(obj, pv, n=151), pv
 
 
 def refit(obj, degree):
@@ -247,8 +253,8 @@ def _swarp_deviation(obj, tpv, n=101):
     return None if errors is None else float(np.hypot(*np.linalg.solve(tpv.cd, errors)).max())
 
 
-def _fit(u, plane, degree):
-    polynomial = shift_origin(*fit_polynomial(u, plane, degree))
+def _fit(u, plane, degree, weights=None):
+    polynomial = shift_origin(*fit_polynomial(u, plane, degree, weights))
     terms = pv_terms(degree)
     coefficients = np.array(
         [polynomial[0, terms.own, terms.other], polynomial[1, terms.other, terms.own]]

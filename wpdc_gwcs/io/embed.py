@@ -127,7 +127,12 @@ def write_into(
         for other, part in enumerate(parts):
             if other != number:
                 gone -= tables_of(part.header)
-    kept = [part for part in parts if part.name not in gone]
+    # Tables of a WCS are never among the images that somebody may want, whatever their names.
+    kept = [
+        part
+        for k, part in enumerate(parts)
+        if k in (0, number) or part.name not in gone or not _may_be_table(part)
+    ]
     versions = {}
     for part in kept:
         name, version = part.name
@@ -148,7 +153,7 @@ def write_into(
                     copy.write(_table_bytes(made.tables, parts[number].header))
             _copy_bytes(source, copy, parts[-1].end, None)
         if output is None:
-            shutil.copymode(path, temporary)
+            _copy_owner(path, temporary)
         with _named(image):
             _check(obj, made, temporary, kept.index(parts[number]), image)
     if alternates == "keep" and with_sip:
@@ -158,6 +163,16 @@ def write_into(
             WPDCWarning,
         )
     return made
+
+
+def _copy_owner(path, temporary):
+    """Give a file the owner and the rights of another, as far as one may."""
+    state = path.stat()
+    if hasattr(os, "chown"):
+        with contextlib.suppress(OSError):
+            os.chown(temporary, state.st_uid, state.st_gid)
+    # Behind the owner, since a new one takes some rights away.
+    shutil.copymode(path, temporary)
 
 
 @contextlib.contextmanager
@@ -192,6 +207,11 @@ def _is_image(header):
         return header_value(header, "ZNAXIS") == 2
     is_table = str(header_value(header, "XTENSION") or "IMAGE").strip() != "IMAGE"
     return not is_table and header_value(header, "NAXIS") == 2
+
+
+def _may_be_table(part):
+    """Tell a table of columns, and an image of the names that look-up tables have."""
+    return not _is_image(part.header) or part.name[0] in ("WCSDVARR", "D2IMARR")
 
 
 def _choose(parts, extension, path):
@@ -292,7 +312,9 @@ def _pad(cards):
 
 
 def _checksum_card(card, value):
-    return f"CHECKSUM= '{value}'{card[28:]}"[:80].ljust(80)
+    """Exchange the value; what is behind one of another length is no comment."""
+    comment = card[28:] if card[10] == card[27] == "'" else ""
+    return f"CHECKSUM= '{value}'{comment}".ljust(80)
 
 
 def _data_sum(source, part):
@@ -326,9 +348,15 @@ def _table_bytes(tables, header):
 
 def _check(obj, made, path, number, image):
     """Read the file back: nothing of the old WCS may have a say in it."""
-    with open_fits(path) as hdus:
-        header = hdus[number].header.copy()
-        tables = [] if made.form == "fits" else [hdu.copy() for hdu in hdus[1:]]
+    try:
+        with open_fits(path) as hdus:
+            header = hdus[number].header.copy()
+            # Not the images of a mosaic, which are large.
+            wanted = set() if made.form == "fits" else tables_of(header)
+            tables = [h.copy() for h in hdus[1:] if (h.name.upper(), h.ver) in wanted]
+    except InputError as problem:
+        reason = str(problem).removeprefix(f"{path}: ")
+        raise FileFormatError(f"{image}: no WCS can be written into it: {reason}") from problem
     found = deviation(obj, astropy_sky(header, tables))
     expected = made.keywords_deviation if made.form == "fits" else made.deviation
     if not found <= _READ_BACK * expected + _ROUNDING_PX:

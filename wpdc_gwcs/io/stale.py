@@ -102,8 +102,9 @@ def tables_of(header):
         ):
             if header_text(header, f"{kind}{axis}").lower() == "lookup":
                 found.add((name, _version(header, f"{record}{axis}.EXTVER")))
-        if header_text(header, f"CTYPE{axis}").endswith("-TAB"):
-            name = header_text(header, f"PS{axis}_0").upper()
+        name = header_text(header, f"PS{axis}_0").upper()
+        # Without a name it refers to nothing, and not to all that have none.
+        if header_text(header, f"CTYPE{axis}").endswith("-TAB") and name:
             found.add((name, _version(header, f"PV{axis}_1")))
     if header_text(header, "WPDCVERS"):
         version = _version(header, "WPDCTAB")

@@ -59,7 +59,7 @@ def expand_pv(coefficients, degree, radial, matrix):
     return polynomial, (in_radius if in_radius.any() else None)
 
 
-def fit_polynomial(points, values, degree):
+def fit_polynomial(points, values, degree, weights=None):
     """Fit a map of the plane by polynomials.
 
     Parameters
@@ -68,6 +68,8 @@ def fit_polynomial(points, values, degree):
         Points and their images.
     degree : int
         Total degree.
+    weights : (N,) ndarray, optional
+        Of the squares of the errors; all the same by default.
 
     Returns
     -------
@@ -83,7 +85,11 @@ def fit_polynomial(points, values, degree):
     u, v = ((point - center) / scale for point, center in zip(points, origin, strict=True))
     powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p)]
     matrix = np.stack([u**p * v**q for p, q in powers], axis=1)
-    fit = np.linalg.lstsq(matrix, np.stack(values, axis=1), rcond=None)[0]
+    values = np.stack(values, axis=1)
+    if weights is not None:
+        root = np.sqrt(weights)[:, np.newaxis]
+        matrix, values = matrix * root, values * root
+    fit = np.linalg.lstsq(matrix, values, rcond=None)[0]
     polynomial = np.zeros((2, degree + 1, degree + 1))
     for (p, q), pair in zip(powers, fit, strict=True):
         polynomial[:, p, q] = pair / scale ** (p + q)
