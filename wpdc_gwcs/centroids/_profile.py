@@ -116,7 +116,7 @@ class Profile:
         kernels.star_profiles(*self._numbers(dx, dy, shares), half, result)
         return result
 
-    def paint(self, image, x, y, flux, half):
+    def paint(self, image, x, y, flux, half, *, first_row=0):
         """Add stars to an image.
 
         Parameters
@@ -127,9 +127,12 @@ class Profile:
             Positions in px, and fluxes.
         half : int
             Stars are 2 half + 1 px wide.
+        first_row : int, optional
+            Row of the frame at which the image begins.
         """
         center = np.rint(np.column_stack([x, y]))
         numbers = self._numbers(x - center[:, 0], y - center[:, 1], self.shares(x, y))
+        center[:, 1] -= first_row
         flux = np.ascontiguousarray(flux, dtype=float)
         kernels.paint_stars(*numbers, half, center, flux, image)
 

@@ -25,8 +25,13 @@ _COLD = 10.0
 # see the photons of stars, which many maps of variances hold and which the gain brings.
 _WEIGHT_CELL = 16
 
-# Rows converted at a time.
-_ROWS = 512
+# Rows worked on at a time: temporary arrays of a whole image take longer to be had than the work.
+_ROWS = 256
+
+# Pixels that may be saturated, in standard deviations above the background.
+_BRIGHT = 5.0
+# What the values of bright pixels may be off by, relative: they are kept as differences.
+_ROUNDING = 2.0**-22
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +48,8 @@ class Background:
         True where a pixel must not be used; None if all are good.
     level : float
         Median of the background that was taken off, in counts.
-    data : (ny, nx) ndarray
-        The image as it came in, in counts, not copied.
+    bright : BrightPixels
+        The bright pixels as they came in.
     unit : float, optional
         Counts in one unit of `image` and `rms`: 1 but for images whose noise is so small or great
         in counts that squares of float32 would not hold it.
@@ -57,9 +62,14 @@ class Background:
     rms: np.ndarray
     mask: np.ndarray | None
     level: float
-    data: np.ndarray
+    bright: "BrightPixels"
     unit: float = 1.0
     photons: np.ndarray | None = None
+
+    @property
+    def shape(self):
+        """Shape of the image, (ny, nx)."""
+        return self.image.shape
 
     @property
     def noise(self):
@@ -67,21 +77,92 @@ class Background:
         step = max(1, min(self.rms.shape) // 500)
         return float(np.median(self.rms[::step, ::step])) * self.unit
 
-    def masked(self, bad):
-        """Return the same with more pixels masked.
-
-        Parameters
-        ----------
-        bad : (ny, nx) ndarray of bool
-            True for the pixels that must not be used either.
+    def copy(self):
+        """Copy the pixels of the image and the mask, which may then be changed.
 
         Returns
         -------
         Background
             Copy.
         """
-        image = np.where(bad, np.float32(0), self.image)
-        return replace(self, image=image, mask=bad if self.mask is None else self.mask | bad)
+        mask = None if self.mask is None else self.mask.copy()
+        return replace(self, image=self.image.copy(), mask=mask)
+
+    def rows(self, start, stop):
+        """Take some rows: views of these, no copies.
+
+        Parameters
+        ----------
+        start, stop : int
+            The first row, and the one behind the last.
+
+        Returns
+        -------
+        Background
+            The rows.
+        """
+        mask, photons = (
+            None if values is None else values[start:stop] for values in (self.mask, self.photons)
+        )
+        size = self.image.shape[1]
+        return replace(
+            self,
+            image=self.image[start:stop],
+            rms=self.rms[start:stop],
+            mask=mask,
+            photons=photons,
+            bright=self.bright.between(start * size, stop * size),
+        )
+
+    def saturated(self, level):
+        """Find the pixels that are saturated.
+
+        Parameters
+        ----------
+        level : float
+            Counts, background included, from which a pixel is.
+
+        Returns
+        -------
+        (ny, nx) ndarray of bool
+            True for those that are; pixels hardly above the background never are.
+        """
+        full = np.zeros(self.image.shape, bool)
+        high = self.bright.values >= level * (1 - _ROUNDING)
+        full.reshape(-1)[self.bright.indices[high]] = True
+        return full
+
+
+@dataclass(frozen=True, eq=False)
+class BrightPixels:
+    """The bright pixels of an image, background included: all that saturation can be about.
+
+    Parameters
+    ----------
+    indices : (N,) ndarray of int
+        Their places in the flat image, ascending.
+    values : (N,) ndarray
+        Their counts.
+    """
+
+    indices: np.ndarray
+    values: np.ndarray
+
+    def between(self, start, stop):
+        """Take those of a part of the flat image.
+
+        Parameters
+        ----------
+        start, stop : int
+            The first place, and the one behind the last.
+
+        Returns
+        -------
+        BrightPixels
+            With places in that part.
+        """
+        k = slice(*np.searchsorted(self.indices, [start, stop]))
+        return BrightPixels(self.indices[k] - start, self.values[k])
 
 
 def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3):
@@ -138,11 +219,10 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3)
         raise ValueError(f"the image must be 2-D and at least 8 x 8 px, got shape {data.shape}")
     if mesh < 4 or filter_size < 1:
         raise ValueError(f"mesh must be >= 4 and filter_size >= 1, got {mesh}, {filter_size}")
-    bad = None
     # Most images are whole, which their extremes tell without an array of their own.
     extremes = np.array([data.min(), data.max()], dtype=float)
-    if not np.isfinite(extremes).all():
-        bad = ~np.isfinite(data)
+    blank = None if np.isfinite(extremes).all() else ~np.isfinite(data)
+    bad = blank
     for name, given in (("mask", mask), ("weight", weight)):
         if given is None:
             continue
@@ -161,42 +241,79 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3)
     # A power of two, so that nothing is rounded.
     unit = 1.0 if _PLAIN[0] < scale < _PLAIN[1] else 2.0 ** np.round(np.log2(scale))
     image = _in_units(data, pedestal, unit)
-    if bad is not None:
-        image[bad] = 0
-    relative = None if weight is None else _relative_noise(np.asarray(weight), bad)
     period = 2 if has_pattern(data, bad, scale) else 1
-    planes = plane_slices(period)
-    rms = np.empty(data.shape, dtype=np.float32)
-    levels = []
-    for plane in planes:
-        part = np.ascontiguousarray(image[plane])
-        hidden = None if bad is None else np.ascontiguousarray(bad[plane])
-        cells = {
-            "mask": hidden,
-            "bh": min(mesh // period, part.shape[0]),
-            "bw": min(mesh // period, part.shape[1]),
-            "fh": filter_size,
-            "fw": filter_size,
-        }
-        estimate = sep.Background(part, **cells)
-        estimate.subfrom(part)
-        image[plane] = part
-        levels.append(estimate.globalback)
-        if relative is None:
-            rms[plane] = estimate.rms(dtype=np.float32)
-        else:
-            flat = sep.Background(part / relative[plane], **cells)
-            rms[plane] = flat.rms(dtype=np.float32) * relative[plane]
+    # Where nobody else has it, its memory is free for what follows.
+    del data
+    if blank is not None:
+        image[blank] = 0
+    relative = None if weight is None else _relative_noise(np.asarray(weight), bad)
+    estimates = [
+        (plane, _estimate(image[plane], bad, plane, relative, mesh // period, filter_size))
+        for plane in plane_slices(period)
+    ]
+    level = float(np.mean([level.globalback for _, (level, _) in estimates]))
+    bright = _take_off(image, bad, estimates, pedestal, unit)
+    rms = _noise_map(image.shape, estimates, relative)
     photons = None if relative is None else _relative_photons(relative)
     if period > 1:
-        photons = np.ones(data.shape, np.float32) if photons is None else photons
-        for plane, response in zip(planes, star_responses(image, rms, bad), strict=True):
+        photons = np.ones(image.shape, np.float32) if photons is None else photons
+        for (plane, _), response in zip(estimates, star_responses(image, rms, bad), strict=True):
             image[plane] /= response
             rms[plane] /= response
             photons[plane] /= response
-    return _finished(
-        Background(image, rms, bad, pedestal + float(np.mean(levels)) * unit, data, unit, photons)
-    )
+    return _finished(Background(image, rms, bad, pedestal + level * unit, bright, unit, photons))
+
+
+def _estimate(part, bad, plane, relative, mesh, filter_size):
+    """Level and noise of a plane of the image: `sep.Background`, for each of the two."""
+    part = np.ascontiguousarray(part)
+    cells = {
+        "mask": None if bad is None else np.ascontiguousarray(bad[plane]),
+        "bh": min(mesh, part.shape[0]),
+        "bw": min(mesh, part.shape[1]),
+        "fh": filter_size,
+        "fw": filter_size,
+    }
+    level = sep.Background(part, **cells)
+    if relative is None:
+        return level, level
+    return level, sep.Background((part - level.back()) / relative[plane], **cells)
+
+
+def _take_off(image, bad, estimates, pedestal, unit):
+    """Take the background off an image, in place; returns its bright pixels, also masked ones."""
+    if len(estimates) == 1:
+        level = estimates[0][1][0].back(dtype=np.float32)
+    else:
+        level = np.empty(image.shape, np.float32)
+        for plane, (estimate, _) in estimates:
+            level[plane] = estimate.back(dtype=np.float32)
+    limit = _BRIGHT * np.median([estimate.globalrms for _, (estimate, _) in estimates])
+    indices, values = [], []
+    for first in range(0, len(image), _ROWS):
+        rows = slice(first, first + _ROWS)
+        part = image[rows]
+        part -= level[rows]
+        high = np.flatnonzero(part > limit)
+        counts = part.reshape(-1)[high].astype(float) + level[rows].reshape(-1)[high]
+        indices.append(high + first * image.shape[1])
+        values.append(counts * unit + pedestal)
+        if bad is not None:
+            part[bad[rows]] = 0
+    return BrightPixels(np.concatenate(indices), np.concatenate(values))
+
+
+def _noise_map(shape, estimates, relative):
+    """Noise of the background in every pixel."""
+    if len(estimates) == 1:
+        rms = estimates[0][1][1].rms(dtype=np.float32)
+    else:
+        rms = np.empty(shape, np.float32)
+        for plane, (_, estimate) in estimates:
+            rms[plane] = estimate.rms(dtype=np.float32)
+    if relative is not None:
+        rms *= relative
+    return rms
 
 
 def _finished(background):
@@ -207,16 +324,18 @@ def _finished(background):
         raise DetectionError(
             f"the image is flat: all pixels near {background.level:g}, no noise, no stars"
         )
-    # Cells of constant pixels (padding, dead regions) have no noise and nothing to detect.
-    dead = ~(rms > 1e-3 * noise)
-    if dead.any():
-        bad = dead if bad is None else bad | dead
-        rms[dead] = noise
-    if image.min() < -_COLD * rms.min():
-        cold = image < -_COLD * rms
-        bad = cold if bad is None else bad | cold
-    if bad is not None:
-        image[bad] = 0
+    floor = 1e-3 * noise
+    # Most images have neither, which their extremes tell.
+    if rms.min() > floor and not image.min() < -_COLD * rms.min():
+        return background
+    bad = np.zeros(image.shape, bool) if bad is None else bad.copy()
+    for first in range(0, len(image), _ROWS):
+        rows = slice(first, first + _ROWS)
+        # Cells of constant pixels (padding, dead regions) have no noise and nothing to detect.
+        dead = ~(rms[rows] > floor)
+        rms[rows][dead] = noise
+        bad[rows] |= dead | (image[rows] < -_COLD * rms[rows])
+        image[rows][bad[rows]] = 0
     return replace(background, mask=bad)
 
 
