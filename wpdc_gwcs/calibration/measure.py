@@ -96,7 +96,9 @@ def measure_sources(frame, settings=None):
     mask = None if frame.load_mask is None else frame.load_mask()
     weight = None if frame.load_weight is None else frame.load_weight()
     # Without a name here, so that the image is gone once its background is off.
-    background = subtract_background(frame.load_image(), mask=mask, weight=weight)
+    background = subtract_background(
+        frame.load_image(), mask=mask, weight=weight, overwrite=frame.fresh_image
+    )
     del mask, weight
     background = mask_hits(background, overwrite=True)
     gain = _first_gain(frame, settings, background)

@@ -8,7 +8,7 @@ from scipy.ndimage import spline_filter, uniform_filter1d
 
 from wpdc_gwcs import kernels
 
-__all__ = ["Profile", "cutouts", "moffat_samples", "spline_coefficients", "spline_taps"]
+__all__ = ["Models", "Profile", "cutouts", "moffat_samples", "spline_coefficients", "spline_taps"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,25 +116,26 @@ class Profile:
         kernels.star_profiles(*self._numbers(dx, dy, shares), half, result)
         return result
 
-    def paint(self, image, x, y, flux, half, *, first_row=0):
-        """Add stars to an image.
+    def models(self, x, y, flux, half):
+        """Make models of stars, which can be drawn.
 
         Parameters
         ----------
-        image : (ny, nx) float32 ndarray
-            The image.
         x, y, flux : (N,) ndarray
             Positions in px, and fluxes.
         half : int
             Stars are 2 half + 1 px wide.
-        first_row : int, optional
-            Row of the frame at which the image begins.
+
+        Returns
+        -------
+        Models
+            The models.
         """
+        order = np.argsort(np.rint(y), kind="stable")
+        x, y, flux = x[order], y[order], np.ascontiguousarray(flux[order], dtype=float)
         center = np.rint(np.column_stack([x, y]))
         numbers = self._numbers(x - center[:, 0], y - center[:, 1], self.shares(x, y))
-        center[:, 1] -= first_row
-        flux = np.ascontiguousarray(flux, dtype=float)
-        kernels.paint_stars(*numbers, half, center, flux, image)
+        return Models(*numbers, half, center, flux)
 
     def _numbers(self, dx, dy, shares):
         """Grids, oversampling, phases and shares as kernels take them."""
@@ -148,6 +149,41 @@ class Profile:
     @property
     def _center(self):
         return (self.coefficients.shape[-1] - 1) // 2
+
+
+@dataclass(frozen=True, eq=False)
+class Models:
+    """Models of stars that can be drawn, in ascending order of their rows.
+
+    Parameters
+    ----------
+    grids, oversampling, phase, shares, half, center, flux
+        As `wpdc_gwcs.kernels.paint_stars` takes them.
+    """
+
+    grids: np.ndarray
+    oversampling: int
+    phase: np.ndarray
+    shares: np.ndarray
+    half: int
+    center: np.ndarray
+    flux: np.ndarray
+
+    def paint(self, image, *, first_row=0):
+        """Add the models to some rows of an image.
+
+        Parameters
+        ----------
+        image : (n, nx) float32 ndarray
+            Rows of the image.
+        first_row : int, optional
+            The first of them.
+        """
+        ends = [first_row - self.half, first_row + len(image) + self.half]
+        k = slice(*np.searchsorted(self.center[:, 1], ends))
+        if k.start < k.stop:
+            numbers = self.grids, self.oversampling, self.phase[k], self.shares[k], self.half
+            kernels.paint_stars(*numbers, self.center[k] - [0, first_row], self.flux[k], image)
 
 
 def spline_taps(position):

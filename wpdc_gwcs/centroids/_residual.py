@@ -1,8 +1,10 @@
 """Images without the models of their stars, strip by strip."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from wpdc_gwcs.centroids._fit import Stars
 from wpdc_gwcs.centroids._profile import Profile
@@ -28,7 +30,7 @@ _MODEL_ERROR = 0.1
 
 
 class Painter:
-    """Draws stars, each as large as its light can be told from the noise.
+    """Makes models of stars, each as large as its light can be told from the noise.
 
     Parameters
     ----------
@@ -67,25 +69,31 @@ class Painter:
         light = np.abs(flux)[:, None] * self._levels
         return self._sizes[(light > self._faintest).sum(axis=1)]
 
-    def paint(self, image, stars, *, first_row=0):
-        """Add stars to an image.
+    def models(self, stars):
+        """Make models of stars.
 
         Parameters
         ----------
-        image : (n, nx) float32 ndarray
-            Rows of the image.
         stars : Stars
             The stars; a negative flux takes light off.
-        first_row : int, optional
-            The first of the rows.
+
+        Returns
+        -------
+        list of Models
+            Those of each size.
         """
-        x, y, flux = stars
-        half = self.half(flux)
-        there = (flux != 0) & (y > first_row - half - 1) & (y < first_row + len(image) + half)
-        for size in self._sizes:
-            k = np.flatnonzero(there & (half == size))
-            if len(k):
-                self.profile.paint(image, x[k], y[k], flux[k], size, first_row=first_row)
+        half = self.half(stars.flux)
+        groups = (stars.take((half == size) & (stars.flux != 0)) for size in self._sizes)
+        pairs = zip(groups, self._sizes, strict=True)
+        return [self.profile.models(*group, size) for group, size in pairs if len(group.x)]
+
+
+def _paint(image, models, first_row):
+    """Make an image of models."""
+    image.fill(0)
+    for one in models:
+        one.paint(image, first_row=first_row)
+    return image
 
 
 class Scene:
@@ -137,32 +145,24 @@ class Scene:
             return np.zeros(0, int)
         gone, come = old.take(changed), stars.take(changed)
         both = Stars(*map(np.concatenate, zip(gone._replace(flux=-gone.flux), come, strict=True)))
-        reach = self._painter.half(both.flux)
-        image = self.field.image
+        models, image = self._painter.models(both), self.field.image
         margin = int(np.ceil(radius))
+        candidates = _near_any(stars, changed, self._painter.half(both.flux).max() + margin + 1)
+        row = np.clip(np.rint(stars.y[candidates]), 0, len(image) - 1)
+        candidates, row = candidates[order := np.argsort(row)], row[order]
         step = max(1, _STRIP // image.shape[1])
-        row = np.rint(stars.y)
-        found = []
+        work = np.empty((step + 2 * margin, image.shape[1]), np.float32)
+        found = [np.zeros(0, int)]
         for first in range(0, len(image), step):
             last = min(first + step, len(image))
             low, high = max(first - margin, 0), min(last + margin, len(image))
-            near = (both.y > low - reach - 1) & (both.y < high + reach)
-            if not near.any():
-                continue
-            light = np.zeros((high - low, image.shape[1]), np.float32)
-            self._painter.paint(light, both.take(near), first_row=low)
+            light = _paint(work[: high - low], models, low)
             image[first:last] -= light[first - low : last - low]
-            # Those off the image have their pixels at its rim.
-            k = np.flatnonzero(
-                (row >= (first if first else -np.inf))
-                & (row < (last if last < len(image) else np.inf))
-            )
+            k = candidates[slice(*np.searchsorted(row, [first, last]))]
             if len(k):
-                disturbed = self._disturbed(
-                    light, low, old.take(k), stars.take(k), changed[k], radius, settled
-                )
-                found.append(k[disturbed])
-        return np.sort(np.concatenate(found)) if found else np.zeros(0, int)
+                sides = old.take(k), stars.take(k)
+                found.append(k[self._disturbed(light, low, *sides, changed[k], radius, settled)])
+        return np.sort(np.concatenate(found))
 
     def _disturbed(self, light, low, old, new, changed, radius, settled):
         """Mark the stars in whose pixels there is light that is not their own."""
@@ -178,6 +178,14 @@ class Scene:
                 others[k] += sign * side.take(k).light(profile, xc[k], yc[k] + low, half)
         limit = settled * (np.sqrt(sky.variance) + _SHARE * np.abs(pixels))
         return (use & (np.abs(others) > limit)).any(axis=1)
+
+
+def _near_any(stars, changed, reach):
+    """Rows of the stars that have another one that has changed within reach along both axes."""
+    places = np.column_stack([stars.x, stars.y])
+    options = {"k": 2, "p": np.inf, "distance_upper_bound": reach}
+    distance = KDTree(places[changed]).query(places, **options)[0]
+    return np.flatnonzero(np.isfinite(np.where(changed, distance[:, 1], distance[:, 0])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,10 +211,10 @@ class Residual:
     stars: Stars
     gain: float | None
     subtracted: bool
-    _painter: Painter = field(init=False, repr=False)
 
-    def __post_init__(self):
-        object.__setattr__(self, "_painter", Painter(self.profile, self.background.rms))
+    @cached_property
+    def _models(self):
+        return Painter(self.profile, self.background.rms).models(self.stars)
 
     @property
     def shape(self):
@@ -232,10 +240,10 @@ class Residual:
         rms = np.empty(part.shape, np.float32)
         # In strips: work space for whole images takes longer to be had than the work itself.
         step = max(1, _STRIP // part.shape[1])
+        work = np.empty((min(step, len(rms)), part.shape[1]), np.float32)
         for first in range(0, len(rms), step):
-            k = slice(first, first + step)
-            model = np.zeros(rms[k].shape, np.float32)
-            self._painter.paint(model, self.stars, first_row=start + first)
+            k = slice(first, min(first + step, len(rms)))
+            model = _paint(work[: k.stop - first], self._models, start + first)
             variance = part.rms[k] ** 2 + (_MODEL_ERROR * model) ** 2
             if self.gain is not None:
                 photons = np.maximum(model, 0) / self.gain

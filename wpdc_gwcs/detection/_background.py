@@ -28,10 +28,8 @@ _WEIGHT_CELL = 16
 # Rows worked on at a time: temporary arrays of a whole image take longer to be had than the work.
 _ROWS = 256
 
-# Pixels that may be saturated, in standard deviations above the background.
+# Pixels that may be saturated, in scatters of all pixels above their median: no sky reaches there.
 _BRIGHT = 5.0
-# What the values of bright pixels may be off by, relative: they are kept as differences.
-_ROUNDING = 2.0**-22
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +126,7 @@ class Background:
             True for those that are; pixels hardly above the background never are.
         """
         full = np.zeros(self.image.shape, bool)
-        high = self.bright.values >= level * (1 - _ROUNDING)
+        high = self.bright.values >= level
         full.reshape(-1)[self.bright.indices[high]] = True
         return full
 
@@ -165,13 +163,13 @@ class BrightPixels:
         return BrightPixels(self.indices[k] - start, self.values[k])
 
 
-def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3):
+def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3, overwrite=False):
     """Take a smooth background off an image and map its noise.
 
     Parameters
     ----------
     data : (ny, nx) array_like
-        Image of any real type, byte order and unit; not modified.
+        Image of any real type, byte order and unit.
     mask : (ny, nx) array_like of bool, optional
         True where a pixel must not be used.  NaN and infinite pixels never are, nor those far
         below the background.
@@ -182,6 +180,8 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3)
         Size in px of the cells within which the background is estimated.
     filter_size : int, optional
         Size in cells of the median filter over the cells.
+    overwrite : bool, optional
+        Whether the memory of `data` may be used for the result.
 
     Returns
     -------
@@ -240,80 +240,61 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3)
         bad = blank if bad is None else bad | blank
     # A power of two, so that nothing is rounded.
     unit = 1.0 if _PLAIN[0] < scale < _PLAIN[1] else 2.0 ** np.round(np.log2(scale))
-    image = _in_units(data, pedestal, unit)
     period = 2 if has_pattern(data, bad, scale) else 1
+    bright = _bright_pixels(data, pedestal + _BRIGHT * scale)
+    image = _in_units(data, pedestal, unit, overwrite=overwrite)
     # Where nobody else has it, its memory is free for what follows.
     del data
     if blank is not None:
         image[blank] = 0
     relative = None if weight is None else _relative_noise(np.asarray(weight), bad)
-    estimates = [
-        (plane, _estimate(image[plane], bad, plane, relative, mesh // period, filter_size))
-        for plane in plane_slices(period)
-    ]
-    level = float(np.mean([level.globalback for _, (level, _) in estimates]))
-    bright = _take_off(image, bad, estimates, pedestal, unit)
-    rms = _noise_map(image.shape, estimates, relative)
+    planes = plane_slices(period)
+    rms = np.empty(image.shape, dtype=np.float32) if period > 1 else None
+    levels = []
+    for plane in planes:
+        part = np.ascontiguousarray(image[plane])
+        hidden = None if bad is None else np.ascontiguousarray(bad[plane])
+        cells = {
+            "mask": hidden,
+            "bh": min(mesh // period, part.shape[0]),
+            "bw": min(mesh // period, part.shape[1]),
+            "fh": filter_size,
+            "fw": filter_size,
+        }
+        estimate = sep.Background(part, **cells)
+        estimate.subfrom(part)
+        levels.append(estimate.globalback)
+        if relative is not None:
+            estimate = sep.Background(part / relative[plane], **cells)
+        noise = estimate.rms(dtype=np.float32)
+        if relative is not None:
+            noise *= relative[plane]
+        if period == 1:
+            image, rms = part, noise
+        else:
+            image[plane], rms[plane] = part, noise
+    if bad is not None:
+        image[bad] = 0
     photons = None if relative is None else _relative_photons(relative)
     if period > 1:
         photons = np.ones(image.shape, np.float32) if photons is None else photons
-        for (plane, _), response in zip(estimates, star_responses(image, rms, bad), strict=True):
+        for plane, response in zip(planes, star_responses(image, rms, bad), strict=True):
             image[plane] /= response
             rms[plane] /= response
             photons[plane] /= response
-    return _finished(Background(image, rms, bad, pedestal + level * unit, bright, unit, photons))
+    level = pedestal + float(np.mean(levels)) * unit
+    return _finished(Background(image, rms, bad, level, bright, unit, photons))
 
 
-def _estimate(part, bad, plane, relative, mesh, filter_size):
-    """Level and noise of a plane of the image: `sep.Background`, for each of the two."""
-    part = np.ascontiguousarray(part)
-    cells = {
-        "mask": None if bad is None else np.ascontiguousarray(bad[plane]),
-        "bh": min(mesh, part.shape[0]),
-        "bw": min(mesh, part.shape[1]),
-        "fh": filter_size,
-        "fw": filter_size,
-    }
-    level = sep.Background(part, **cells)
-    if relative is None:
-        return level, level
-    return level, sep.Background((part - level.back()) / relative[plane], **cells)
-
-
-def _take_off(image, bad, estimates, pedestal, unit):
-    """Take the background off an image, in place; returns its bright pixels, also masked ones."""
-    if len(estimates) == 1:
-        level = estimates[0][1][0].back(dtype=np.float32)
-    else:
-        level = np.empty(image.shape, np.float32)
-        for plane, (estimate, _) in estimates:
-            level[plane] = estimate.back(dtype=np.float32)
-    limit = _BRIGHT * np.median([estimate.globalrms for _, (estimate, _) in estimates])
+def _bright_pixels(data, limit):
+    """Pixels above a limit, masked ones too."""
     indices, values = [], []
-    for first in range(0, len(image), _ROWS):
-        rows = slice(first, first + _ROWS)
-        part = image[rows]
-        part -= level[rows]
+    for first in range(0, len(data), _ROWS):
+        part = data[first : first + _ROWS].reshape(-1)
         high = np.flatnonzero(part > limit)
-        counts = part.reshape(-1)[high].astype(float) + level[rows].reshape(-1)[high]
-        indices.append(high + first * image.shape[1])
-        values.append(counts * unit + pedestal)
-        if bad is not None:
-            part[bad[rows]] = 0
+        indices.append(high + first * data.shape[1])
+        values.append(part[high])
     return BrightPixels(np.concatenate(indices), np.concatenate(values))
-
-
-def _noise_map(shape, estimates, relative):
-    """Noise of the background in every pixel."""
-    if len(estimates) == 1:
-        rms = estimates[0][1][1].rms(dtype=np.float32)
-    else:
-        rms = np.empty(shape, np.float32)
-        for plane, (_, estimate) in estimates:
-            rms[plane] = estimate.rms(dtype=np.float32)
-    if relative is not None:
-        rms *= relative
-    return rms
 
 
 def _finished(background):
@@ -360,9 +341,10 @@ def _level_and_scatter(data, bad):
     return pedestal, scatter
 
 
-def _in_units(data, pedestal, unit):
+def _in_units(data, pedestal, unit, *, overwrite):
     """Difference from a first level, so that float32 keeps the noise on a high pedestal."""
-    image = np.empty(data.shape, dtype=np.float32)
+    here = overwrite and data.dtype == np.float32 and data.flags.carray
+    image = data if here else np.empty(data.shape, dtype=np.float32)
     for first in range(0, len(data), _ROWS):
         rows = slice(first, first + _ROWS)
         with np.errstate(over="ignore", invalid="ignore"):
