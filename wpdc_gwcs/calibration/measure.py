@@ -252,7 +252,7 @@ def _fit_psf(background, detected, epsf, gain, threshold):
 
     Returns the sources as they were detected, companions included, and as they were fitted.
     """
-    fitted = fit_centroids(background, detected, epsf, gain=gain, overwrite=True)
+    fitted = fit_centroids(background, detected, epsf, gain=gain, overwrite=True, judge=False)
     residual = residual_of(background, fitted, epsf, gain=gain, subtracted=True)
     detected = detect_companions(residual, detected, threshold=threshold, gain=gain)
     start = detected.copy()

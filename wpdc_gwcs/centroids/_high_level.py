@@ -11,7 +11,7 @@ from wpdc_gwcs.centroids._noise import estimate_noise, least_gain
 from wpdc_gwcs.centroids._photutils import from_photutils, to_photutils
 from wpdc_gwcs.centroids._psf import MIN_STARS, learn_psf
 from wpdc_gwcs.centroids._residual import Residual, Scene
-from wpdc_gwcs.centroids._rounds import MAX_CHI2, fit_all, near, noise_bins
+from wpdc_gwcs.centroids._rounds import MAX_CHI2, fit_all, judge_neighbors, near, noise_bins
 from wpdc_gwcs.exceptions import CentroidWarning
 from wpdc_gwcs.flags import FLAG_FIT_FAILED
 from wpdc_gwcs.selection import select_sources
@@ -146,6 +146,7 @@ def fit_centroids(
     refit=False,
     subtracted=None,
     overwrite=False,
+    judge=True,
 ):
     r"""Fit an effective PSF to all sources.
 
@@ -172,6 +173,9 @@ def fit_centroids(
     overwrite : bool, optional
         Take the models of the fitted stars off the image of the Background itself, and leave it
         so, instead of off a copy.
+    judge : bool, optional
+        Whether to find what neighbors cost, and who is broader than a star: errors and flags of a
+        first round do without.
 
     Returns
     -------
@@ -234,17 +238,11 @@ def fit_centroids(
         if "flags" in sources.colnames
         else np.zeros(len(stars.x), int)
     )
-    fits, shift, flags = fit_all(
-        Scene(field, profile, drawn),
-        profile,
-        stars,
-        quality,
-        flags,
-        fwhm,
-        _per_unit(gain, unit),
-        passes,
-        refit,
-    )
+    scene, gain = Scene(field, profile, drawn), _per_unit(gain, unit)
+    fits, noise = fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit)
+    shift = np.zeros(len(stars.x))
+    if judge:
+        fits, shift, flags = judge_neighbors(scene, profile, noise, fits, stars, flags, fwhm)
     return _fitted_table(sources, fits, shift, flags, fwhm, unit)
 
 

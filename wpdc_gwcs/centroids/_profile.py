@@ -139,8 +139,14 @@ class Profile:
 
     def _numbers(self, dx, dy, shares):
         """Grids, oversampling, phases and shares as kernels take them."""
-        taps = [spline_taps(self._center - self.oversampling * d) for d in (dx, dy)]
-        phase = np.column_stack([column for columns in taps for column in columns])
+        n = len(dx)
+        position = np.concatenate([dx, dy]) * -self.oversampling + self._center
+        phase = np.empty((n, 18))
+        for first, column in zip((0, 1, 5), spline_taps(position), strict=True):
+            width = 1 if column.ndim == 1 else column.shape[1]
+            for part in (0, 1):
+                values = column[part * n : (part + 1) * n].reshape(n, width)
+                phase[:, 9 * part + first : 9 * part + first + width] = values
         grids, shares = (
             np.ascontiguousarray(values, dtype=float) for values in (self._components[0], shares)
         )
@@ -201,15 +207,20 @@ def spline_taps(position):
     weights, slopes : (N, 4) ndarray
         Values of the splines, and their derivatives by the position.
     """
-    base = np.floor(position).astype(int)
+    base = np.floor(position)
     t = position - base
-    weights = np.stack(
-        [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], axis=1
-    )
-    slopes = np.stack(
-        [-3 * (1 - t) ** 2, 9 * t**2 - 12 * t, -9 * t**2 + 6 * t + 3, 3 * t**2], axis=1
-    )
-    return base, weights / 6, slopes / 6
+    square, rest = t * t, (1 - t) ** 2
+    cube = square * t
+    weights, slopes = np.empty((2, len(t), 4))
+    weights[:, 0] = rest * (1 - t) / 6
+    weights[:, 1] = 0.5 * cube - square + 2 / 3
+    weights[:, 2] = 0.5 * (square + t - cube) + 1 / 6
+    weights[:, 3] = cube / 6
+    slopes[:, 0] = -0.5 * rest
+    slopes[:, 1] = 1.5 * square - 2 * t
+    slopes[:, 2] = t - 1.5 * square + 0.5
+    slopes[:, 3] = 0.5 * square
+    return base.astype(int), weights, slopes
 
 
 def spline_coefficients(samples):

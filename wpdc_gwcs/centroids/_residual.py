@@ -12,7 +12,7 @@ from wpdc_gwcs.centroids._profile import Profile
 __all__ = ["Painter", "Residual", "Scene"]
 
 # Pixels of an image that are worked on at a time: they stay in the cache.
-_STRIP = 1_000_000
+_STRIP = 3_000_000
 
 # Half-widths in px that stars are drawn with, up to that of the profile: faint ones are smaller.
 _SIZES = (3, 5, 8, 12)

@@ -13,7 +13,7 @@ from wpdc_gwcs.centroids._noise import Noise, bin_noise, estimate_noise
 from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EXTENDED, FLAG_SATURATED
 from wpdc_gwcs.threads import one_blas_thread
 
-__all__ = ["MAX_CHI2", "fit_all", "near", "noise_bins"]
+__all__ = ["MAX_CHI2", "fit_all", "judge_neighbors", "near", "noise_bins"]
 
 log = logging.getLogger(__name__)
 
@@ -81,8 +81,8 @@ def noise_bins(field, profile, stars, quality, fwhm, gain, *, own=None):
 
 
 @one_blas_thread
-def fit_all(scene, profile, stars, quality, flags, fwhm, gain, passes, refit):
-    """Fit all stars, and find what their neighbors cost them.
+def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
+    """Fit all stars in turn.
 
     Parameters
     ----------
@@ -94,8 +94,6 @@ def fit_all(scene, profile, stars, quality, flags, fwhm, gain, passes, refit):
         Start values.
     quality : (N,) ndarray of bool
         True for stars of good quality, which tell the noise.
-    flags : (N,) ndarray of int
-        Flags of the sources.
     fwhm : float
         FWHM in px.
     gain : float or None
@@ -108,11 +106,9 @@ def fit_all(scene, profile, stars, quality, flags, fwhm, gain, passes, refit):
     Returns
     -------
     fits : StarFits
-        With the covariance of all stars together.
-    shift : (N,) ndarray
-        Error of the positions in px by what is wrong in the models of neighbors.
-    flags : (N,) ndarray of int
-        Flags.
+        The fits, each with the covariance of the star alone.
+    noise : Noise
+        Noise of the pixels.
     """
     radius = fit_radius(fwhm)
     bins, _ = noise_bins(scene.field, profile, stars, quality, fwhm, gain, own=scene.own)
@@ -130,11 +126,39 @@ def fit_all(scene, profile, stars, quality, flags, fwhm, gain, passes, refit):
         log.debug("round %d: the light beside %d stars has changed", k, len(rows))
         if len(rows) == 0:
             break
-    return _judge_neighbors(scene, profile, noise, fits, stars, flags, fwhm)
+    return fits, noise
 
 
-def _judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
-    """Fits with the covariance of all stars together, errors by neighbors, flags of blends."""
+@one_blas_thread
+def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
+    """Find what neighbors cost the fits, and who is broader than a star.
+
+    Parameters
+    ----------
+    scene : Scene
+        The pixels without the stars.
+    profile : Profile
+        The PSF.
+    noise : Noise
+        Noise of the pixels.
+    fits : StarFits
+        The fits.
+    start : Stars
+        Where they began.
+    flags : (N,) ndarray of int
+        Flags of the sources.
+    fwhm : float
+        FWHM in px.
+
+    Returns
+    -------
+    fits : StarFits
+        With the covariance of all stars together.
+    shift : (N,) ndarray
+        Error of the positions in px by what is wrong in the models of neighbors.
+    flags : (N,) ndarray of int
+        Flags.
+    """
     radius, field, own = fit_radius(fwhm), scene.field, scene.drawn
     fitted = own.flux > 0
     clean = (flags == 0) & star_like(own.flux, fits.chi2, fitted, limit=MAX_CHI2)
