@@ -16,6 +16,7 @@ from wpdc_gwcs.detection import (
 )
 from wpdc_gwcs.exceptions import CentroidWarning, DetectionError, WPDCWarning
 from wpdc_gwcs.selection import judge_sources, left_out
+from wpdc_gwcs.stages import announce
 
 __all__ = ["measure_sources", "quality_of", "rules_of"]
 
@@ -93,6 +94,7 @@ def measure_sources(frame, settings=None):
             f"{frame.source}: the image must be at least {_SMALLEST} x {_SMALLEST} px, is of shape "
             f"(ny, nx) {frame.image_shape}"
         )
+    announce("background")
     mask = None if frame.load_mask is None else frame.load_mask()
     weight = None if frame.load_weight is None else frame.load_weight()
     # Without a name here, so that the image is gone once its background is off.
@@ -103,10 +105,12 @@ def measure_sources(frame, settings=None):
     background = mask_hits(background, overwrite=True)
     gain = _first_gain(frame, settings, background)
     saturation = _saturation(frame, settings, background)
+    announce("detection")
     options = {"threshold": settings.threshold, "saturation": saturation}
     detected = detect_sources(background, gain=gain, **options)
     sources = detected
     if settings.centroids == "psf":
+        announce("PSF")
         epsf = measure_psf(background, detected, gain=gain)
         if epsf is not None:
             noise = measure_noise(background, detected, epsf)
@@ -252,12 +256,15 @@ def _fit_psf(background, detected, epsf, gain, threshold):
 
     Returns the sources as they were detected, companions included, and as they were fitted.
     """
+    announce("fits")
     fitted = fit_centroids(background, detected, epsf, gain=gain, overwrite=True, judge=False)
+    announce("companions")
     residual = residual_of(background, fitted, epsf, gain=gain, subtracted=True)
     detected = detect_companions(residual, detected, threshold=threshold, gain=gain)
     start = detected.copy()
     for name in ("x", "y", "flux"):
         start[name][: len(fitted)] = fitted[name]
+    announce("fits")
     return detected, fit_centroids(
         background,
         start,
