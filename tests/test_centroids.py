@@ -4,7 +4,14 @@ from astropy.table import Table
 from photutils.psf import GriddedPSFModel, ImagePSF, PSFPhotometry, SourceGrouper
 from scipy.special import erf
 
-from wpdc_gwcs.centroids import _profile, build_epsf, fit_centroids, subtract_stars
+from wpdc_gwcs.centroids import (
+    _profile,
+    build_epsf,
+    fit_centroids,
+    measure_psf,
+    residual_of,
+    subtract_stars,
+)
 from wpdc_gwcs.detection import (
     FLAG_BLENDED,
     FLAG_FIT_FAILED,
@@ -248,6 +255,57 @@ def test_subtracted_stars_leave_noise(frame):
     assert len(detect_companions(residual, frame["sources"])) <= len(result) + 2
     with pytest.raises(ValueError, match="threshold must be positive, got 0"):
         detect_companions(residual, frame["sources"], threshold=0)
+
+
+def test_models_are_taken_off_the_image_itself(frame):
+    background, sources, epsf = (frame[name] for name in ("background", "sources", "epsf"))
+    before = background.image.copy()
+    work = background.copy()
+    fitted = fit_centroids(work, sources, epsf, gain=GAIN, overwrite=True)
+    np.testing.assert_array_equal(background.image, before)
+    expected = frame["result"]
+    np.testing.assert_allclose(fitted["x"], expected["x"], rtol=1e-9)
+    # What is left is the image without the stars, however often each has been drawn anew.
+    residual = subtract_stars(background, fitted, epsf, gain=GAIN)
+    np.testing.assert_allclose(work.image, residual.image, atol=2e-3 * background.noise)
+    # Fits that go on from there are those of the whole image.
+    again = fit_centroids(
+        work, fitted, epsf, gain=GAIN, refit=True, subtracted=fitted, overwrite=True
+    )
+    whole = fit_centroids(background, fitted, epsf, gain=GAIN, refit=True)
+    good = np.isfinite(whole["chi2"])
+    assert good.mean() > 0.98
+    for name in ("x", "y"):
+        off = (again[name] - whole[name])[good] / whole["x_err"][good]
+        assert np.abs(off).max() < 0.02
+    np.testing.assert_allclose(again["x_err"][good], whole["x_err"][good], rtol=5e-3)
+
+
+def test_residuals_are_the_same_in_strips_and_whole(frame):
+    background, result, epsf = (frame[name] for name in ("background", "result", "epsf"))
+    whole = subtract_stars(background, result, epsf, gain=GAIN)
+    parts = residual_of(background, result, epsf, gain=GAIN)
+    assert parts.shape == whole.image.shape
+    for start, stop in ((0, 37), (37, 160), (160, whole.image.shape[0])):
+        strip = parts.rows(start, stop)
+        np.testing.assert_allclose(strip.image, whole.image[start:stop], atol=1e-3)
+        np.testing.assert_allclose(strip.rms, whole.rms[start:stop], rtol=1e-5)
+    found = detect_companions(parts, frame["sources"], gain=GAIN)
+    assert len(found) == len(detect_companions(whole, frame["sources"], gain=GAIN))
+
+
+def test_psf_without_photutils_is_the_same(frame):
+    background, sources = frame["background"], frame["sources"]
+    profile = measure_psf(background, sources, gain=GAIN)
+    result = fit_centroids(background, sources, profile, gain=GAIN)
+    np.testing.assert_allclose(result["x"], frame["result"]["x"], atol=1e-7)
+
+
+def test_first_round_has_the_positions_without_the_judgement(frame):
+    background, sources, epsf = (frame[name] for name in ("background", "sources", "epsf"))
+    rough = fit_centroids(background, sources, epsf, gain=GAIN, judge=False)
+    for name in ("x", "y", "flux"):
+        np.testing.assert_array_equal(rough[name], frame["result"][name])
 
 
 def test_unknown_gain_is_learnt(frame):

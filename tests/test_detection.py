@@ -13,6 +13,7 @@ from wpdc_gwcs.detection import (
     FLAG_EXTENDED,
     FLAG_SATURATED,
     detect_sources,
+    mask_hits,
     subtract_background,
 )
 from wpdc_gwcs.exceptions import DetectionError
@@ -243,6 +244,33 @@ def test_nan_borders_and_dead_regions(field):
     _, distance = nearest(sources, x[inside], y[inside])
     assert np.mean(distance < 0.3) > 0.97
     assert (sources["x"] > 55).all()
+
+
+def test_memory_is_used_only_where_it_may_be(field):
+    image = np.array(field[0], np.float32)
+    before = image.copy()
+    expected = mask_hits(subtract_background(image))
+    np.testing.assert_array_equal(image, before)
+    background = subtract_background(image, overwrite=True)
+    assert np.shares_memory(background.image, image)
+    found = mask_hits(background, overwrite=True)
+    np.testing.assert_array_equal(found.image, expected.image)
+    np.testing.assert_array_equal(found.rms, expected.rms)
+
+
+def test_rows_are_views_and_know_their_bright_pixels(rng):
+    image = rng.normal(100, 5, (90, 70)).astype(np.float32)
+    image[33, 20:24] = 6000
+    background = subtract_background(image)
+    strip = background.rows(30, 60)
+    assert np.shares_memory(strip.image, background.image)
+    full = background.saturated(5000)
+    assert np.argwhere(full).tolist() == [[33, x] for x in range(20, 24)]
+    np.testing.assert_array_equal(strip.saturated(5000), full[30:60])
+    assert not background.rows(40, 60).saturated(5000).any()
+    # At the very value of the pixels too.
+    assert background.saturated(6000).sum() == 4
+    assert not background.saturated(6001).any()
 
 
 def test_mask_hides_sources(field):

@@ -53,6 +53,9 @@ class Frame:
         one of weights, inverse variances of the sky of any scale.
     inputs : tuple of str, optional
         Files besides that of ``source`` that the loaders read.
+    fresh_image : bool, optional
+        Whether nobody else has the image that ``load_image`` returns: its memory is then used for
+        the work.
 
     Raises
     ------
@@ -86,6 +89,7 @@ class Frame:
     load_mask: Callable | None = None
     load_weight: Callable | None = None
     inputs: tuple[str, ...] = ()
+    fresh_image: bool = False
 
     def __post_init__(self):
         if (self.load_image is None) == (self.load_sources is None):

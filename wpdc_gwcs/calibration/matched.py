@@ -21,6 +21,7 @@ from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
 from wpdc_gwcs.selection import left_out
+from wpdc_gwcs.stages import announce
 
 __all__ = [
     "FailedFrame",
@@ -109,6 +110,7 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
         catalog = read_catalog(catalog)
     if sources is None:
         sources = measure_sources(frame, settings)
+    announce("matching")
     sources = with_errors(sources)
     usable = usable_sources(sources, frame, settings)
     x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 
 from wpdc_gwcs.calibration.settings import Settings
-from wpdc_gwcs.centroids import build_epsf, fit_centroids, measure_noise, subtract_stars
+from wpdc_gwcs.centroids import fit_centroids, measure_noise, measure_psf, residual_of
 from wpdc_gwcs.detection import (
     detect_companions,
     detect_sources,
@@ -16,6 +16,7 @@ from wpdc_gwcs.detection import (
 )
 from wpdc_gwcs.exceptions import CentroidWarning, DetectionError, WPDCWarning
 from wpdc_gwcs.selection import judge_sources, left_out
+from wpdc_gwcs.stages import announce
 
 __all__ = ["measure_sources", "quality_of", "rules_of"]
 
@@ -93,17 +94,24 @@ def measure_sources(frame, settings=None):
             f"{frame.source}: the image must be at least {_SMALLEST} x {_SMALLEST} px, is of shape "
             f"(ny, nx) {frame.image_shape}"
         )
-    image = frame.load_image()
+    announce("background")
     mask = None if frame.load_mask is None else frame.load_mask()
     weight = None if frame.load_weight is None else frame.load_weight()
-    background = mask_hits(subtract_background(image, mask=mask, weight=weight))
+    # Without a name here, so that the image is gone once its background is off.
+    background = subtract_background(
+        frame.load_image(), mask=mask, weight=weight, overwrite=frame.fresh_image
+    )
+    del mask, weight
+    background = mask_hits(background, overwrite=True)
     gain = _first_gain(frame, settings, background)
     saturation = _saturation(frame, settings, background)
+    announce("detection")
     options = {"threshold": settings.threshold, "saturation": saturation}
     detected = detect_sources(background, gain=gain, **options)
     sources = detected
     if settings.centroids == "psf":
-        epsf = build_epsf(background, detected, gain=gain)
+        announce("PSF")
+        epsf = measure_psf(background, detected, gain=gain)
         if epsf is not None:
             noise = measure_noise(background, detected, epsf)
             wrong = settings.gain is None and _contradicts(gain, noise)
@@ -115,7 +123,7 @@ def measure_sources(frame, settings=None):
                 gain = measured if measured > 0 else None
                 detected = detect_sources(background, gain=gain, **options)
                 if wrong:
-                    epsf = build_epsf(background, detected, gain=gain)
+                    epsf = measure_psf(background, detected, gain=gain)
             detected, sources = _fit_psf(background, detected, epsf, gain, settings.threshold)
             sources.meta.update(gain=noise.gain if gain is None else gain, mismatch=noise.mismatch)
     sources.meta["noise"] = background.noise
@@ -220,7 +228,7 @@ def _measure_gain(background, detected, noise):
     other["snr"][half] = 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CentroidWarning)
-        epsf = build_epsf(background, one)
+        epsf = measure_psf(background, one)
     return noise.gain if epsf is None else measure_noise(background, other, epsf).gain
 
 
@@ -244,16 +252,26 @@ def _warn(frame, what, value, why):
 
 
 def _fit_psf(background, detected, epsf, gain, threshold):
-    """Fit the PSF to all sources and to what shows once they are subtracted.
+    """Fit the PSF to all sources and to what shows once they are subtracted from the image.
 
     Returns the sources as they were detected, companions included, and as they were fitted.
     """
-    fitted = fit_centroids(background, detected, epsf, gain=gain)
-    residual = subtract_stars(background, fitted, epsf, gain=gain)
+    announce("fits")
+    fitted = fit_centroids(background, detected, epsf, gain=gain, overwrite=True, judge=False)
+    announce("companions")
+    residual = residual_of(background, fitted, epsf, gain=gain, subtracted=True)
     detected = detect_companions(residual, detected, threshold=threshold, gain=gain)
     start = detected.copy()
     for name in ("x", "y", "flux"):
         start[name][: len(fitted)] = fitted[name]
+    announce("fits")
     return detected, fit_centroids(
-        background, start, epsf, gain=gain, refit=True, passes=_PASSES_OF_PAIRS
+        background,
+        start,
+        epsf,
+        gain=gain,
+        refit=True,
+        passes=_PASSES_OF_PAIRS,
+        subtracted=fitted,
+        overwrite=True,
     )

@@ -33,6 +33,7 @@ from wpdc_gwcs.exceptions import (
 )
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.frozen import freeze_attributes
+from wpdc_gwcs.stages import announce, listening
 from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["CalibrationRun", "calibrate"]
@@ -124,7 +125,8 @@ def calibrate(
         Leave out what a run of the same frames, catalog, settings and versions has written into
         the folder already, and go on with it.
     progress : callable, optional
-        Called as ``progress(stage, done, total)`` while the run goes on.
+        Called as ``progress(stage, done, total)`` while the run goes on; for the stages of one
+        frame, which have no number, as ``progress(stage, 0, 0)``.
 
     Returns
     -------
@@ -169,7 +171,7 @@ def calibrate(
     frames = _named_apart(tie_exposures(frames)) if solution is None else tie_exposures(frames)
     groups = cameras_of(frames)
     folder = None if output is None else ResultFolder(output, overwrite=overwrite, resume=resume)
-    with folder or nullcontext():
+    with folder or nullcontext(), listening(lambda stage: progress(stage, 0, 0)):
         path = catalog if isinstance(catalog, str | os.PathLike) else None
         # Before the catalog, which may take a while.
         if folder is not None:
@@ -199,6 +201,7 @@ def calibrate(
                 for name, error in outcome.failures.items():
                     _log_details(name, error, folder)
                 if folder is not None:
+                    announce("files")
                     folder.write(group, outcome)
     resumed = tuple(frame.name for group in done for frame in group)
     return _joined(frames, list(outcomes.values()), run_id, resumed)
@@ -260,6 +263,7 @@ def _outcomes(groups, run, workers):
                 results[name] = tasks.pop(name)()
                 run.progress("match", next(counter), n_frames)
             run.progress("solve", k, len(groups))
+            announce("solution")
             outcome = _outcome_of(group, results, run, None if other else workers)
         except ClusterError as err:
             lost = err

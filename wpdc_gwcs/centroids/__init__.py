@@ -11,7 +11,17 @@ from wpdc_gwcs.centroids._high_level import (
     build_epsf,
     fit_centroids,
     measure_noise,
+    measure_psf,
+    residual_of,
     subtract_stars,
 )
 
-__all__ = ["StarNoise", "build_epsf", "fit_centroids", "measure_noise", "subtract_stars"]
+__all__ = [
+    "StarNoise",
+    "build_epsf",
+    "fit_centroids",
+    "measure_noise",
+    "measure_psf",
+    "residual_of",
+    "subtract_stars",
+]

@@ -10,7 +10,7 @@ __all__ = ["judge_profiles", "weigh_neighbors"]
 # Neighbors that share pixels with a fit are at most this far, in radii of the fits.
 _REACH = 1.8
 # Pairs at a time: bounds the memory for their pixels.
-_CHUNK = 20_000
+_CHUNK = 4000
 
 # Significance in sigma of the broadening along the direction where it is greatest, which one star
 # in a hundred exceeds by noise, of any profile.  Where the width is known better than the next

@@ -13,8 +13,8 @@ __all__ = [
     "Field",
     "StarFits",
     "Stars",
+    "fit_radius",
     "fit_stars",
-    "render",
     "star_like",
 ]
 
@@ -65,6 +65,26 @@ class Field:
     mask: np.ndarray | None
     photons: np.ndarray | None = None
 
+    def rows(self, start, stop, *, image):
+        """Take some rows, with another image for theirs.
+
+        Parameters
+        ----------
+        start, stop : int
+            The first row, and the one behind the last.
+        image : (stop - start, nx) ndarray
+            Pixels.
+
+        Returns
+        -------
+        Field
+            The rows.
+        """
+        mask, photons = (
+            None if values is None else values[start:stop] for values in (self.mask, self.photons)
+        )
+        return Field(image, self.rms[start:stop], mask, photons)
+
     def cut(self, stars, half, radius):
         """Cut out the surroundings of stars.
 
@@ -110,6 +130,27 @@ class Stars(NamedTuple):
         """Stars of the given rows."""
         return Stars(*(column[rows] for column in self))
 
+    def light(self, profile, xc, yc, half):
+        """Evaluate the models of the stars in their cut-outs.
+
+        Parameters
+        ----------
+        profile : Profile
+            The PSF.
+        xc, yc : (N,) int ndarray
+            Central pixels.
+        half : int
+            The cut-outs are 2 half + 1 px wide.
+
+        Returns
+        -------
+        (N, n) ndarray
+            Counts.
+        """
+        shares = profile.shares(self.x, self.y)
+        value = profile.evaluate(self.x - xc, self.y - yc, half, shares, gradient=False)[0]
+        return np.multiply(value, self.flux[:, None], out=value)
+
 
 @dataclass(frozen=True, eq=False)
 class StarFits:
@@ -152,6 +193,22 @@ class StarFits:
         return *self.stars, self.covariance, self.chi2, self.valid
 
 
+def fit_radius(fwhm):
+    """Radius in px of the pixels that stars are fitted on.
+
+    Parameters
+    ----------
+    fwhm : float
+        FWHM in px.
+
+    Returns
+    -------
+    float
+        Radius.
+    """
+    return max(1.25 * fwhm, 2.5)
+
+
 def fit_stars(field, profile, noise, stars, *, radius, own=None):
     """Fit position and flux of stars, each on the pixels within a radius of its start.
 
@@ -188,9 +245,7 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
     half = int(np.ceil(radius))
     xc, yc, pixels, use, sky = field.cut(stars, half, radius)
     if own is not None:
-        shares = profile.shares(own.x, own.y)
-        model = profile.evaluate(own.x - xc, own.y - yc, half, shares, gradient=False)[0]
-        pixels += own.flux[:, None] * model
+        pixels += own.light(profile, xc, yc, half)
     x, y, flux = (np.array(v, dtype=float) for v in stars)
     shares = profile.shares(x, y)
     flux = np.maximum(flux, 1e-6)
@@ -238,42 +293,6 @@ def _normal_step(basis, flux, pixels, use, sky, noise):
         basis, flux, pixels, use, sky.variance, photons, numbers, step, covariance, chi2
     )
     return step, covariance, chi2
-
-
-def render(shape, profile, stars, *, faintest=0.0):
-    """Image of the stars' models.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Shape of the image.
-    profile : Profile
-        The PSF.
-    stars : Stars
-        The stars.
-    faintest : float, optional
-        Counts that may be left out in the wings of a star; faint stars are drawn smaller.
-
-    Returns
-    -------
-    (ny, nx) float32 ndarray
-        The image.
-    """
-    x, y, flux = stars
-    image = np.zeros(shape, dtype=np.float32)
-    samples = np.abs(profile.samples()).max(axis=0)
-    center = samples.shape[0] // 2
-    full = profile.radius - 1
-    # Greatest value at or beyond every distance along the axes.
-    distance = np.abs(np.arange(samples.shape[0]) - center) / profile.oversampling
-    line = np.maximum(samples[center], samples[:, center])
-    sizes = np.unique(np.minimum([3, 5, 8, 12, full], full))
-    level = np.array([line[distance >= size].max() for size in sizes[:-1]])
-    group = (flux[:, None] * level > faintest).sum(axis=1)
-    for g, half in enumerate(sizes):
-        rows = np.flatnonzero(group == g)
-        profile.paint(image, x[rows], y[rows], flux[rows], half)
-    return image
 
 
 def star_like(flux, chi2, valid, *, limit=2.5, width=31):

@@ -66,7 +66,7 @@ class NoiseBins(NamedTuple):
     square: np.ndarray
 
 
-def bin_noise(field, profile, noise, stars, *, radius, modes=()):
+def bin_noise(field, profile, noise, stars, *, radius, modes=(), own=None):
     """Measure the noise in pixels of well measured stars.
 
     Parameters
@@ -75,6 +75,8 @@ def bin_noise(field, profile, noise, stars, *, radius, modes=()):
         As for `fit_stars`; stars where the fit has converged.
     modes : sequence of Profile, optional
         Changes of the profile that each star may have for its own: what they take up is no noise.
+    own : Stars, optional
+        Models that were subtracted from the image, as for `fit_stars`.
 
     Returns
     -------
@@ -83,6 +85,8 @@ def bin_noise(field, profile, noise, stars, *, radius, modes=()):
     """
     half = int(np.ceil(radius))
     xc, yc, pixels, use, sky = field.cut(stars, half, radius)
+    if own is not None:
+        pixels += own.light(profile, xc, yc, half)
     shares = profile.shares(stars.x, stars.y)
     basis = profile.evaluate(stars.x - xc, stars.y - yc, half, shares)
     flux = stars.flux

@@ -8,7 +8,7 @@ from scipy.ndimage import spline_filter, uniform_filter1d
 
 from wpdc_gwcs import kernels
 
-__all__ = ["Profile", "cutouts", "moffat_samples", "spline_coefficients", "spline_taps"]
+__all__ = ["Models", "Profile", "cutouts", "moffat_samples", "spline_coefficients", "spline_taps"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,27 +116,37 @@ class Profile:
         kernels.star_profiles(*self._numbers(dx, dy, shares), half, result)
         return result
 
-    def paint(self, image, x, y, flux, half):
-        """Add stars to an image.
+    def models(self, x, y, flux, half):
+        """Make models of stars, which can be drawn.
 
         Parameters
         ----------
-        image : (ny, nx) float32 ndarray
-            The image.
         x, y, flux : (N,) ndarray
             Positions in px, and fluxes.
         half : int
             Stars are 2 half + 1 px wide.
+
+        Returns
+        -------
+        Models
+            The models.
         """
+        order = np.argsort(np.rint(y), kind="stable")
+        x, y, flux = x[order], y[order], np.ascontiguousarray(flux[order], dtype=float)
         center = np.rint(np.column_stack([x, y]))
         numbers = self._numbers(x - center[:, 0], y - center[:, 1], self.shares(x, y))
-        flux = np.ascontiguousarray(flux, dtype=float)
-        kernels.paint_stars(*numbers, half, center, flux, image)
+        return Models(*numbers, half, center, flux)
 
     def _numbers(self, dx, dy, shares):
         """Grids, oversampling, phases and shares as kernels take them."""
-        taps = [spline_taps(self._center - self.oversampling * d) for d in (dx, dy)]
-        phase = np.column_stack([column for columns in taps for column in columns])
+        n = len(dx)
+        position = np.concatenate([dx, dy]) * -self.oversampling + self._center
+        phase = np.empty((n, 18))
+        for first, column in zip((0, 1, 5), spline_taps(position), strict=True):
+            width = 1 if column.ndim == 1 else column.shape[1]
+            for part in (0, 1):
+                values = column[part * n : (part + 1) * n].reshape(n, width)
+                phase[:, 9 * part + first : 9 * part + first + width] = values
         grids, shares = (
             np.ascontiguousarray(values, dtype=float) for values in (self._components[0], shares)
         )
@@ -145,6 +155,41 @@ class Profile:
     @property
     def _center(self):
         return (self.coefficients.shape[-1] - 1) // 2
+
+
+@dataclass(frozen=True, eq=False)
+class Models:
+    """Models of stars that can be drawn, in ascending order of their rows.
+
+    Parameters
+    ----------
+    grids, oversampling, phase, shares, half, center, flux
+        As `wpdc_gwcs.kernels.paint_stars` takes them.
+    """
+
+    grids: np.ndarray
+    oversampling: int
+    phase: np.ndarray
+    shares: np.ndarray
+    half: int
+    center: np.ndarray
+    flux: np.ndarray
+
+    def paint(self, image, *, first_row=0):
+        """Add the models to some rows of an image.
+
+        Parameters
+        ----------
+        image : (n, nx) float32 ndarray
+            Rows of the image.
+        first_row : int, optional
+            The first of them.
+        """
+        ends = [first_row - self.half, first_row + len(image) + self.half]
+        k = slice(*np.searchsorted(self.center[:, 1], ends))
+        if k.start < k.stop:
+            numbers = self.grids, self.oversampling, self.phase[k], self.shares[k], self.half
+            kernels.paint_stars(*numbers, self.center[k] - [0, first_row], self.flux[k], image)
 
 
 def spline_taps(position):
@@ -162,15 +207,20 @@ def spline_taps(position):
     weights, slopes : (N, 4) ndarray
         Values of the splines, and their derivatives by the position.
     """
-    base = np.floor(position).astype(int)
+    base = np.floor(position)
     t = position - base
-    weights = np.stack(
-        [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], axis=1
-    )
-    slopes = np.stack(
-        [-3 * (1 - t) ** 2, 9 * t**2 - 12 * t, -9 * t**2 + 6 * t + 3, 3 * t**2], axis=1
-    )
-    return base, weights / 6, slopes / 6
+    square, rest = t * t, (1 - t) ** 2
+    cube = square * t
+    weights, slopes = np.empty((2, len(t), 4))
+    weights[:, 0] = rest * (1 - t) / 6
+    weights[:, 1] = 0.5 * cube - square + 2 / 3
+    weights[:, 2] = 0.5 * (square + t - cube) + 1 / 6
+    weights[:, 3] = cube / 6
+    slopes[:, 0] = -0.5 * rest
+    slopes[:, 1] = 1.5 * square - 2 * t
+    slopes[:, 2] = t - 1.5 * square + 0.5
+    slopes[:, 3] = 0.5 * square
+    return base.astype(int), weights, slopes
 
 
 def spline_coefficients(samples):

@@ -27,7 +27,7 @@ def progress_bar(*, quiet=False):
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (
-        TextColumn("{task.description:>8}"),
+        TextColumn("{task.description:>10}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -36,8 +36,11 @@ def progress_bar(*, quiet=False):
         tasks = {}
 
         def progress(stage, done, total):
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done)
+            # Stages of a frame have no number: they take turns in one line.
+            name = stage if total else None
+            if name not in tasks:
+                tasks[name] = bar.add_task(stage, total=total or None)
+            # At once: those that work in C keep the thread that would do it waiting.
+            bar.update(tasks[name], completed=done, description=stage, refresh=True)
 
         yield progress

@@ -25,8 +25,11 @@ _COLD = 10.0
 # see the photons of stars, which many maps of variances hold and which the gain brings.
 _WEIGHT_CELL = 16
 
-# Rows converted at a time.
-_ROWS = 512
+# Rows worked on at a time: temporary arrays of a whole image take longer to be had than the work.
+_ROWS = 256
+
+# Pixels that may be saturated, in scatters of all pixels above their median: no sky reaches there.
+_BRIGHT = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +46,8 @@ class Background:
         True where a pixel must not be used; None if all are good.
     level : float
         Median of the background that was taken off, in counts.
-    data : (ny, nx) ndarray
-        The image as it came in, in counts, not copied.
+    bright : BrightPixels
+        The bright pixels as they came in.
     unit : float, optional
         Counts in one unit of `image` and `rms`: 1 but for images whose noise is so small or great
         in counts that squares of float32 would not hold it.
@@ -57,9 +60,14 @@ class Background:
     rms: np.ndarray
     mask: np.ndarray | None
     level: float
-    data: np.ndarray
+    bright: "BrightPixels"
     unit: float = 1.0
     photons: np.ndarray | None = None
+
+    @property
+    def shape(self):
+        """Shape of the image, (ny, nx)."""
+        return self.image.shape
 
     @property
     def noise(self):
@@ -67,30 +75,101 @@ class Background:
         step = max(1, min(self.rms.shape) // 500)
         return float(np.median(self.rms[::step, ::step])) * self.unit
 
-    def masked(self, bad):
-        """Return the same with more pixels masked.
-
-        Parameters
-        ----------
-        bad : (ny, nx) ndarray of bool
-            True for the pixels that must not be used either.
+    def copy(self):
+        """Copy the pixels of the image and the mask, which may then be changed.
 
         Returns
         -------
         Background
             Copy.
         """
-        image = np.where(bad, np.float32(0), self.image)
-        return replace(self, image=image, mask=bad if self.mask is None else self.mask | bad)
+        mask = None if self.mask is None else self.mask.copy()
+        return replace(self, image=self.image.copy(), mask=mask)
+
+    def rows(self, start, stop):
+        """Take some rows: views of these, no copies.
+
+        Parameters
+        ----------
+        start, stop : int
+            The first row, and the one behind the last.
+
+        Returns
+        -------
+        Background
+            The rows.
+        """
+        mask, photons = (
+            None if values is None else values[start:stop] for values in (self.mask, self.photons)
+        )
+        size = self.image.shape[1]
+        return replace(
+            self,
+            image=self.image[start:stop],
+            rms=self.rms[start:stop],
+            mask=mask,
+            photons=photons,
+            bright=self.bright.between(start * size, stop * size),
+        )
+
+    def saturated(self, level):
+        """Find the pixels that are saturated.
+
+        Parameters
+        ----------
+        level : float
+            Counts, background included, from which a pixel is.
+
+        Returns
+        -------
+        (ny, nx) ndarray of bool
+            True for those that are; pixels hardly above the background never are.
+        """
+        full = np.zeros(self.image.shape, bool)
+        high = self.bright.values >= level
+        full.reshape(-1)[self.bright.indices[high]] = True
+        return full
 
 
-def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3):
+@dataclass(frozen=True, eq=False)
+class BrightPixels:
+    """The bright pixels of an image, background included: all that saturation can be about.
+
+    Parameters
+    ----------
+    indices : (N,) ndarray of int
+        Their places in the flat image, ascending.
+    values : (N,) ndarray
+        Their counts.
+    """
+
+    indices: np.ndarray
+    values: np.ndarray
+
+    def between(self, start, stop):
+        """Take those of a part of the flat image.
+
+        Parameters
+        ----------
+        start, stop : int
+            The first place, and the one behind the last.
+
+        Returns
+        -------
+        BrightPixels
+            With places in that part.
+        """
+        k = slice(*np.searchsorted(self.indices, [start, stop]))
+        return BrightPixels(self.indices[k] - start, self.values[k])
+
+
+def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3, overwrite=False):
     """Take a smooth background off an image and map its noise.
 
     Parameters
     ----------
     data : (ny, nx) array_like
-        Image of any real type, byte order and unit; not modified.
+        Image of any real type, byte order and unit.
     mask : (ny, nx) array_like of bool, optional
         True where a pixel must not be used.  NaN and infinite pixels never are, nor those far
         below the background.
@@ -101,6 +180,8 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3)
         Size in px of the cells within which the background is estimated.
     filter_size : int, optional
         Size in cells of the median filter over the cells.
+    overwrite : bool, optional
+        Whether the memory of `data` may be used for the result.
 
     Returns
     -------
@@ -138,11 +219,10 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3)
         raise ValueError(f"the image must be 2-D and at least 8 x 8 px, got shape {data.shape}")
     if mesh < 4 or filter_size < 1:
         raise ValueError(f"mesh must be >= 4 and filter_size >= 1, got {mesh}, {filter_size}")
-    bad = None
     # Most images are whole, which their extremes tell without an array of their own.
     extremes = np.array([data.min(), data.max()], dtype=float)
-    if not np.isfinite(extremes).all():
-        bad = ~np.isfinite(data)
+    blank = None if np.isfinite(extremes).all() else ~np.isfinite(data)
+    bad = blank
     for name, given in (("mask", mask), ("weight", weight)):
         if given is None:
             continue
@@ -160,13 +240,16 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3)
         bad = blank if bad is None else bad | blank
     # A power of two, so that nothing is rounded.
     unit = 1.0 if _PLAIN[0] < scale < _PLAIN[1] else 2.0 ** np.round(np.log2(scale))
-    image = _in_units(data, pedestal, unit)
-    if bad is not None:
-        image[bad] = 0
-    relative = None if weight is None else _relative_noise(np.asarray(weight), bad)
     period = 2 if has_pattern(data, bad, scale) else 1
+    bright = _bright_pixels(data, pedestal + _BRIGHT * scale)
+    image = _in_units(data, pedestal, unit, overwrite=overwrite)
+    # Where nobody else has it, its memory is free for what follows.
+    del data
+    if blank is not None:
+        image[blank] = 0
+    relative = None if weight is None else _relative_noise(np.asarray(weight), bad)
     planes = plane_slices(period)
-    rms = np.empty(data.shape, dtype=np.float32)
+    rms = np.empty(image.shape, dtype=np.float32) if period > 1 else None
     levels = []
     for plane in planes:
         part = np.ascontiguousarray(image[plane])
@@ -180,23 +263,38 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3)
         }
         estimate = sep.Background(part, **cells)
         estimate.subfrom(part)
-        image[plane] = part
         levels.append(estimate.globalback)
-        if relative is None:
-            rms[plane] = estimate.rms(dtype=np.float32)
+        if relative is not None:
+            estimate = sep.Background(part / relative[plane], **cells)
+        noise = estimate.rms(dtype=np.float32)
+        if relative is not None:
+            noise *= relative[plane]
+        if period == 1:
+            image, rms = part, noise
         else:
-            flat = sep.Background(part / relative[plane], **cells)
-            rms[plane] = flat.rms(dtype=np.float32) * relative[plane]
+            image[plane], rms[plane] = part, noise
+    if bad is not None:
+        image[bad] = 0
     photons = None if relative is None else _relative_photons(relative)
     if period > 1:
-        photons = np.ones(data.shape, np.float32) if photons is None else photons
+        photons = np.ones(image.shape, np.float32) if photons is None else photons
         for plane, response in zip(planes, star_responses(image, rms, bad), strict=True):
             image[plane] /= response
             rms[plane] /= response
             photons[plane] /= response
-    return _finished(
-        Background(image, rms, bad, pedestal + float(np.mean(levels)) * unit, data, unit, photons)
-    )
+    level = pedestal + float(np.mean(levels)) * unit
+    return _finished(Background(image, rms, bad, level, bright, unit, photons))
+
+
+def _bright_pixels(data, limit):
+    """Pixels above a limit, masked ones too."""
+    indices, values = [], []
+    for first in range(0, len(data), _ROWS):
+        part = data[first : first + _ROWS].reshape(-1)
+        high = np.flatnonzero(part > limit)
+        indices.append(high + first * data.shape[1])
+        values.append(part[high])
+    return BrightPixels(np.concatenate(indices), np.concatenate(values))
 
 
 def _finished(background):
@@ -207,16 +305,18 @@ def _finished(background):
         raise DetectionError(
             f"the image is flat: all pixels near {background.level:g}, no noise, no stars"
         )
-    # Cells of constant pixels (padding, dead regions) have no noise and nothing to detect.
-    dead = ~(rms > 1e-3 * noise)
-    if dead.any():
-        bad = dead if bad is None else bad | dead
-        rms[dead] = noise
-    if image.min() < -_COLD * rms.min():
-        cold = image < -_COLD * rms
-        bad = cold if bad is None else bad | cold
-    if bad is not None:
-        image[bad] = 0
+    floor = 1e-3 * noise
+    # Most images have neither, which their extremes tell.
+    if rms.min() > floor and not image.min() < -_COLD * rms.min():
+        return background
+    bad = np.zeros(image.shape, bool) if bad is None else bad.copy()
+    for first in range(0, len(image), _ROWS):
+        rows = slice(first, first + _ROWS)
+        # Cells of constant pixels (padding, dead regions) have no noise and nothing to detect.
+        dead = ~(rms[rows] > floor)
+        rms[rows][dead] = noise
+        bad[rows] |= dead | (image[rows] < -_COLD * rms[rows])
+        image[rows][bad[rows]] = 0
     return replace(background, mask=bad)
 
 
@@ -241,9 +341,10 @@ def _level_and_scatter(data, bad):
     return pedestal, scatter
 
 
-def _in_units(data, pedestal, unit):
+def _in_units(data, pedestal, unit, *, overwrite):
     """Difference from a first level, so that float32 keeps the noise on a high pedestal."""
-    image = np.empty(data.shape, dtype=np.float32)
+    here = overwrite and data.dtype == np.float32 and data.flags.carray
+    image = data if here else np.empty(data.shape, dtype=np.float32)
     for first in range(0, len(data), _ROWS):
         rows = slice(first, first + _ROWS)
         with np.errstate(over="ignore", invalid="ignore"):

@@ -5,7 +5,7 @@ import sep
 
 from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, cutouts, mode, sizes, window
 
-__all__ = ["extract_peaks", "is_broad", "star_size", "typical_fwhm"]
+__all__ = ["extract_peaks", "is_broad", "search", "star_size", "typical_fwhm"]
 
 # Smoothing before the threshold: close to a matched filter for FWHM 1.5 to 3 px, and narrow enough
 # not to merge neighbors.
@@ -16,9 +16,11 @@ _KERNEL = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]) / 16
 _BROAD = 4.5
 
 # Rows searched at a time, and their overlap: every source is taken whole, from the strip that holds
-# its peak.
-_STRIP = 512
+# its peak.  Arrays of more pixels than that would be had from the system anew each time, which
+# takes longer than the work on them.
+_STRIP = 1024
 _OVERLAP = 64
+_PIXELS = 7_000_000
 
 # Sources that tell the size of the stars.
 _N_BRIGHT = 500
@@ -43,35 +45,59 @@ def extract_peaks(background, threshold, deblend_contrast, fwhm=0.0):
     structured array
         As from `sep.extract`.
     """
-    image, rms, mask = background.image, background.rms, background.mask
+    parts = []
+    for start, _, found in search(background, threshold, deblend_contrast, fwhm):
+        for name in ("y", "ypeak", "ycpeak"):
+            found[name] += start
+        parts.append(found)
+    return np.concatenate(parts)
+
+
+def search(background, threshold, deblend_contrast, fwhm=0.0):
+    """Extract peaks strip by strip, because sep compares every source with every other one.
+
+    Parameters
+    ----------
+    background : Background
+        Image without background, or what gives its rows.
+    threshold, deblend_contrast, fwhm
+        As for `extract_peaks`.
+
+    Yields
+    ------
+    start : int
+        First row of a strip.
+    strip : Background
+        The strip: rows around those whose peaks are looked for.
+    found : structured array
+        As from `sep.extract`, in pixels of the strip.
+    """
     # sep's defaults are for small images: it gives up where more pixels or branches are active.
     sep.set_sub_object_limit(8192)
     kernel = _kernel(fwhm)
     threshold = threshold * np.sqrt((kernel**2).sum())
-    parts = []
-    # In strips, because sep compares every source with every other one.
-    for first in range(0, image.shape[0], _STRIP):
-        last = min(first + _STRIP, image.shape[0])
-        start, stop = max(first - _OVERLAP, 0), min(last + _OVERLAP, image.shape[0])
+    overlap = max(_OVERLAP, int(3 * fwhm))
+    n_rows, n_columns = background.shape
+    step = int(np.clip(_PIXELS // n_columns - 2 * overlap, overlap, _STRIP))
+    for first in range(0, n_rows, step):
+        last = min(first + step, n_rows)
+        start = max(first - overlap, 0)
+        strip = background.rows(start, min(last + overlap, n_rows))
         # Room for all pixels of all sources; no more, because sep writes to all of it every time.
-        active = np.count_nonzero(image[start:stop] > threshold * rms[start:stop])
-        sep.set_extract_pixstack(
-            min(300_000 + 3 * active, 300_000 + (stop - start) * image.shape[1])
-        )
-        part = sep.extract(
-            image[start:stop],
+        active = np.count_nonzero(strip.image > threshold * strip.rms)
+        sep.set_extract_pixstack(min(300_000 + 3 * active, 300_000 + strip.image.size))
+        found = sep.extract(
+            strip.image,
             threshold,
-            err=rms[start:stop],
-            mask=None if mask is None else mask[start:stop],
+            err=strip.rms,
+            mask=strip.mask,
             minarea=3,
             filter_kernel=kernel,
             filter_type="conv",
             deblend_cont=deblend_contrast,
         )
-        for name in ("y", "ypeak", "ycpeak"):
-            part[name] += start
-        parts.append(part[(part["ycpeak"] >= first) & (part["ycpeak"] < last)])
-    return np.concatenate(parts)
+        row = found["ycpeak"] + start
+        yield start, strip, found[(row >= first) & (row < last)]
 
 
 def is_broad(fwhm):

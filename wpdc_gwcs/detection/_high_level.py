@@ -8,7 +8,7 @@ from astropy.table import Table, vstack
 from scipy.spatial import KDTree
 
 from wpdc_gwcs.detection._background import Background, subtract_background
-from wpdc_gwcs.detection._extract import extract_peaks, is_broad, typical_fwhm
+from wpdc_gwcs.detection._extract import extract_peaks, is_broad, search, typical_fwhm
 from wpdc_gwcs.detection._hits import mask_hits
 from wpdc_gwcs.detection._saturation import plateau
 from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, measure_shapes, mode
@@ -33,6 +33,21 @@ _RESOLVED = 0.6
 
 # Sources that tell what stars look like, by signal-to-noise ratio.
 _STAR_SNR = 30.0
+
+# Columns of sources, in this order; and flags.
+_COLUMNS = (
+    "x",
+    "y",
+    "x_err",
+    "y_err",
+    "flux",
+    "flux_err",
+    "snr",
+    "peak",
+    "fwhm",
+    "roundness",
+    "sharpness",
+)
 
 # Sources measured at a time: bounds the memory for their cut-outs to some tens of MB.
 _CHUNK = 20_000
@@ -110,7 +125,7 @@ def detect_sources(
         if value is not None and not value > 0:
             raise ValueError(f"{name} must be positive, got {value}")
     if not isinstance(data, Background):
-        data = mask_hits(subtract_background(data, mask=mask))
+        data = mask_hits(subtract_background(data, mask=mask), overwrite=True)
     elif mask is not None:
         raise ValueError("mask must be given to subtract_background when data is a Background")
     found = extract_peaks(data, threshold, deblend_contrast)
@@ -121,7 +136,7 @@ def detect_sources(
     fwhm = typical_fwhm(data, found)
     if is_broad(fwhm):
         found = extract_peaks(data, threshold, deblend_contrast, fwhm)
-    table = _measure(data, found, fwhm, gain, saturation)
+    table = _table_of([_measure(data, found, fwhm, gain, saturation)], fwhm)
     table.meta.update(fwhm=fwhm, saturation=saturation)
     log.info(
         "%d sources, %d of them clean, FWHM %.2f px",
@@ -139,7 +154,8 @@ def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_co
     ----------
     residual : Background
         Image without the known sources, and the noise with their models' error, as from
-        `wpdc_gwcs.centroids.subtract_stars`.
+        `wpdc_gwcs.centroids.subtract_stars`; or any object with its ``shape`` that gives its
+        ``rows(start, stop)``.
     sources : `~astropy.table.Table`
         The known sources, from `detect_sources`.
     threshold : float, optional
@@ -182,10 +198,15 @@ def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_co
     if not threshold > 0:
         raise ValueError(f"threshold must be positive, got {threshold}")
     fwhm = sources.meta["fwhm"]
-    found = extract_peaks(residual, threshold, deblend_contrast, fwhm)
+    saturation, parts = sources.meta["saturation"], []
+    for start, strip, found in search(residual, threshold, deblend_contrast, fwhm):
+        if len(found):
+            part = _measure(strip, found, fwhm, gain, saturation)
+            part["y"] += start
+            parts.append(part)
     result = sources.copy()
-    if len(found):
-        new = _measure(residual, found, fwhm, gain, sources.meta["saturation"])
+    if parts:
+        new = _table_of(parts, fwhm)
         distance = KDTree(_places(sources)).query(_places(new))[0]
         new = new[(distance > _RESOLVED * fwhm) & (new["flags"] & FLAG_SATURATED == 0)]
         log.info("%d more sources beside those subtracted", len(new))
@@ -201,35 +222,35 @@ def _places(table):
 
 
 def _measure(background, found, fwhm, gain, saturation):
-    """Measure all sources; returns the table, in counts."""
+    """Measure all sources by themselves; returns columns, in counts."""
     image, rms, bad, unit = background.image, background.rms, background.mask, background.unit
     gain = None if gain is None else gain * unit
-    sigma = fwhm * SIGMA_PER_FWHM
-    x, y = _windowed(background, found, sigma, fwhm)
+    full = None if saturation is None else background.saturated(saturation)
+    x, y = _windowed(background, found, fwhm * SIGMA_PER_FWHM, fwhm)
     radius = 1.5 * fwhm
     flux, flux_err, _ = sep.sum_circle(image, x, y, radius, err=rms, mask=bad, gain=gain, subpix=5)
     parts = [
         measure_shapes(
-            background, x[k], y[k], found["xpeak"][k], found["ypeak"][k], fwhm, gain, saturation
+            background, x[k], y[k], found["xpeak"][k], found["ypeak"][k], fwhm, gain, full
         )
         for k in (slice(start, start + _CHUNK) for start in range(0, len(found), _CHUNK))
     ]
     shapes = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
-    flags = shapes.pop("flags")
-    minor, size = shapes.pop("minor"), shapes["fwhm"]
     shapes["peak"] *= unit
+    return {"x": x, "y": y, "flux": flux * unit, "flux_err": flux_err * unit} | shapes
+
+
+def _table_of(parts, fwhm):
+    """Table of the sources measured, with the flags that tell them from each other."""
+    shapes = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    x, y, flux = (shapes[name] for name in ("x", "y", "flux"))
+    flags, minor, size = (shapes.pop(name) for name in ("flags", "minor", "fwhm"))
     flags |= _unlike_stars(minor, size, shapes["snr"], flags)
-    shapes["fwhm"] = np.where(np.isfinite(size), size, np.nan)
     ellipticity = _ellipticity(minor, size, shapes["snr"], flags)
     flags |= np.where(_blended(x, y, flux, fwhm), FLAG_BLENDED, 0)
-    return Table(
-        {"x": x, "y": y}
-        | {name: shapes.pop(name) for name in ("x_err", "y_err")}
-        | {"flux": flux * unit, "flux_err": flux_err * unit}
-        | shapes
-        | {"flags": flags},
-        meta={"ellipticity": ellipticity},
-    )
+    shapes["fwhm"] = np.where(np.isfinite(size), size, np.nan)
+    columns = {name: shapes[name] for name in _COLUMNS}
+    return Table(columns | {"flags": flags}, meta={"ellipticity": ellipticity})
 
 
 def _windowed(background, found, sigma, fwhm):

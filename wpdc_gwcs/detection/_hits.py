@@ -1,6 +1,7 @@
 """Hits of cosmic rays and hot pixels: sharper than any star of the image can be."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import erf
@@ -28,17 +29,22 @@ _MARGIN = 0.6
 # Standard deviations by which noise may take light from the pixels beside, or add to the peak.
 _NOISE = 2.5
 
+# Rows searched at a time.
+_ROWS = 256
+
 # Opposite neighbors in four directions.
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
-def mask_hits(background):
+def mask_hits(background, *, overwrite=False):
     r"""Mask the pixels that cosmic rays and defects have lit.
 
     Parameters
     ----------
     background : Background
         Image without background.
+    overwrite : bool, optional
+        Whether the pixels of the image and its mask may be changed, instead of copies.
 
     Returns
     -------
@@ -67,9 +73,7 @@ def mask_hits(background):
     [[50, 70]]
     """
     image, rms = background.image, background.rms
-    bright = image > _MIN_PEAK * rms
-    bright[0] = bright[-1] = bright[:, 0] = bright[:, -1] = False
-    y, x = np.nonzero(bright)
+    y, x = _peaks(image, rms)
     if len(x) == 0:
         return background
     peak, noise = image[y, x], rms[y, x]
@@ -96,9 +100,22 @@ def mask_hits(background):
     if not hit.any():
         return background
     log.info("%d pixels masked as hits", np.count_nonzero(hit))
-    bad = np.zeros(image.shape, bool)
-    bad[y[hit], x[hit]] = True
-    return background.masked(bad)
+    result = background if overwrite else background.copy()
+    mask = np.zeros(image.shape, bool) if result.mask is None else result.mask
+    mask[y[hit], x[hit]] = True
+    result.image[y[hit], x[hit]] = 0
+    return replace(result, mask=mask)
+
+
+def _peaks(image, rms):
+    """Rows and columns of the pixels tested; at the rim, neighbors are missing."""
+    rows, columns = [], []
+    for first in range(1, len(image) - 1, _ROWS):
+        inner = slice(first, min(first + _ROWS, len(image) - 1)), slice(1, -1)
+        y, x = np.nonzero(image[inner] > _MIN_PEAK * rms[inner])
+        rows.append(y + first)
+        columns.append(x + 1)
+    return np.concatenate(rows), np.concatenate(columns)
 
 
 def _sharper(peak, pairs, noise, fwhm):

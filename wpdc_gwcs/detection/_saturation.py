@@ -58,14 +58,14 @@ def plateau(background):
     Peaks of stars are the rarer the brighter they are: pixels crowded at the very top have been cut
     off there.
     """
-    image = background.image
-    top = float(image.max())
-    if not top > 0:
-        return None
+    indices, values = background.bright.indices, background.bright.values
+    height = background.image.reshape(-1)[indices]
+    top = float(height.max(initial=0.0))
     # Extremes of the image without background, which varies far less than stars' peaks.
-    high = image > 0.9 * top
-    values = background.data[high if background.mask is None else high & ~background.mask]
-    values = (values.astype(float) - background.level) / background.unit
+    high = height > 0.9 * top
+    if background.mask is not None:
+        high &= ~background.mask.reshape(-1)[indices]
+    values = (values[high].astype(float) - background.level) / background.unit
     limit = 0.999 * values.max(initial=0.0)
     at_top = np.count_nonzero(values >= limit)
     if at_top < max(5, 2 * (values.size - at_top)) or top < 50 * np.median(background.rms[::99]):

@@ -101,7 +101,7 @@ def sizes(pixels, dx, dy, weight, sigma):
     return np.sqrt(variance)
 
 
-def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, saturation):
+def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, full):
     """Measure errors, S/N, shape and per-pixel flags of some sources.
 
     Parameters
@@ -116,8 +116,8 @@ def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, saturation):
         Of the stars, px.
     gain : float or None
         Electrons per unit of the background.
-    saturation : float or None
-        Counts from which a pixel is saturated.
+    full : (ny, nx) ndarray of bool or None
+        True for the pixels that are saturated.
 
     Returns
     -------
@@ -146,8 +146,8 @@ def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, saturation):
         masked = cutouts(bad, xc, yc, half)
         weight *= ~masked
         flags |= np.where((masked & core).any((1, 2)), FLAG_BAD_PIXEL, 0)
-    if saturation is not None:
-        full = cutouts(background.data, xc, yc, half) >= saturation
+    if full is not None:
+        full = cutouts(full, xc, yc, half)
         flags |= np.where((full & core).any((1, 2)), FLAG_SATURATED, 0)
     variance = cutouts(background.rms, xc, yc, half).astype(float) ** 2
     if gain is not None:

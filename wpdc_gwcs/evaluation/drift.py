@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.table import QTable, Table
 from scipy.ndimage import median
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from wpdc_gwcs.robust import robust_scatter
 
@@ -327,7 +327,7 @@ def _whole(solution, grids):
         2.0 * n,
         2.0 * np.sum((1 - share) ** 2 + common * share**2 + 2 * share * (1 - share)),
     )
-    return float(chi2.sf(2 * value * mean / variance, 2 * mean**2 / variance))
+    return float(chdtrc(2 * mean**2 / variance, 2 * value * mean / variance))
 
 
 def _localize(stars, grids, limit):
@@ -378,7 +378,7 @@ def _uniform(n_grid, cells, finer):
         square = np.sum((small.mean - mean[:, parent]) ** 2 / small.variance, axis=0)
         total = np.bincount(parent, square, minlength=n_grid**2)
         freedom = 2 * (np.bincount(parent, minlength=n_grid**2) - 1)
-        good &= chi2.sf(total, np.maximum(freedom, 1)) > _UNIFORM
+        good &= chdtrc(np.maximum(freedom, 1), total) > _UNIFORM
     return good[cells.index]
 
 

@@ -445,7 +445,7 @@ def _image_loaders(part, path):
     """Loaders of pixels, mask and weight."""
     shape = tuple(part["shape"])
     load = functools.partial(load_image, path, part["index"], part["plane"])
-    loaders = {"load_image": load}
+    loaders = {"load_image": load, "fresh_image": True}
     masks = [c for c in part["companions"] if c.role == "mask"]
     if masks or part["section"] is not None:
         loaders["load_mask"] = functools.partial(

@@ -310,4 +310,7 @@ def _as_float(data, blank, scale, zero):
         if blank is not None:
             image[data == blank * scale + zero] = np.nan
         return image
-    return data.astype(np.float64 if data.dtype.itemsize == 8 else np.float32)
+    if data.dtype.itemsize == 8 or data.dtype.itemsize == 2 or not data.flags.writeable:
+        return data.astype(np.float64 if data.dtype.itemsize == 8 else np.float32)
+    # In the memory of what was read: that of another image takes longer to be had than the swap.
+    return data if data.dtype.isnative else data.byteswap(inplace=True).view(np.float32)

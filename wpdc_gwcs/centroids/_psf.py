@@ -1,0 +1,98 @@
+"""The profile of a frame: constant or varying, of one width or with finer structure."""
+
+import logging
+
+import numpy as np
+
+from wpdc_gwcs.centroids._blends import judge_profiles
+from wpdc_gwcs.centroids._build import OVERSAMPLING, fit_moffat, learn_profile, vary_profile
+from wpdc_gwcs.centroids._fit import fit_radius, fit_stars
+from wpdc_gwcs.centroids._noise import Noise
+from wpdc_gwcs.centroids._profile import Profile, moffat_samples
+from wpdc_gwcs.threads import one_blas_thread
+
+__all__ = ["MIN_STARS", "learn_psf"]
+
+log = logging.getLogger(__name__)
+
+# Stars without which there is no profile.
+MIN_STARS = 8
+# Error of the PSF, relative, up to which it is as smooth as its width tells; and the FWHM in px of
+# the finest structure looked for otherwise.
+_FAIR_MISMATCH = 0.03
+_FINEST = 1.4
+# Share of broad stars that is not chance.
+_BROAD_SHARE = 0.04
+# Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
+_STARS_FOR_DEGREE = (30, 60, 200)
+
+
+@one_blas_thread
+def learn_psf(field, stars, fwhm, gain, vary):
+    """Learn the profile of a frame from its stars.
+
+    Parameters
+    ----------
+    field : Field
+        Pixels.
+    stars : Stars
+        Bright, clean and isolated stars.
+    fwhm : float
+        FWHM in px.
+    gain : float or None
+        Electrons per unit of the image.
+    vary : {"auto", "never"}
+        Whether the profile may vary over the detector.
+
+    Returns
+    -------
+    Profile or None
+        None if the fits fail.
+    """
+    half = int(np.clip(np.ceil(3 * fwhm), 6, 20)) + 1
+    radius = fit_radius(fwhm)
+    wide = radius + 0.5 * fwhm
+    noise = Noise(0.0 if gain is None else 1 / gain, 0.03)
+    shape = fit_moffat(field, noise, stars.take(slice(200)), fwhm, half=half, radius=wide)
+    start = Profile.constant(moffat_samples(shape, half, OVERSAMPLING), OVERSAMPLING)
+    options = {"fwhm": fwhm, "radius": radius, "gain": gain}
+    chosen = stars
+    profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=4, **options)
+    broad, _ = judge_profiles(field, profile, noise, stars, stars.flux > 0, fwhm, radius)
+    if broad.mean() > _BROAD_SHARE and np.count_nonzero(~broad) >= MIN_STARS:
+        # Hidden companions have made the profile broader.
+        chosen = stars.take(~broad)
+        profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=2, **options)
+    finest = fwhm
+    while noise.mismatch > _FAIR_MISMATCH and finest > 2 * _FINEST:
+        # Rings and trails have edges that are finer than they are wide.
+        finest = max(0.25 * finest, _FINEST)
+        finer = options | {"iterations": 4, "finest": finest}
+        found = learn_profile(field, noise, chosen, profile, **finer)
+        if len(found[1].x) >= max(MIN_STARS, len(stars.x) // 2):
+            if found[2].mismatch < noise.mismatch:
+                options["finest"] = finest
+                profile, stars, noise = found
+    n = len(stars.x)
+    if n < MIN_STARS:
+        return None
+    log.info("effective PSF from %d stars, own error %.3f", n, noise.mismatch)
+    degree = int(np.searchsorted(_STARS_FOR_DEGREE, n))
+    if vary == "never" or degree == 0:
+        return profile
+    # Every fifth star, by brightness, is left out to judge by.
+    left_out = np.arange(n) % 5 == 2
+    options["iterations"] = 2
+    trial = {"radius": wide, "degree": degree}
+    varying = vary_profile(field, noise, stars.take(~left_out), profile, fwhm, **trial)
+    chi2 = [
+        np.median(fit_stars(field, p, noise, stars.take(left_out), radius=radius).chi2)
+        for p in (profile, varying)
+    ]
+    log.info("chi2 of left-out stars: constant PSF %.3f, varying %.3f", *chi2)
+    if not chi2[1] < 0.99 * chi2[0]:
+        return profile
+    varying = vary_profile(field, noise, stars, profile, fwhm, **trial)
+    varying, stars, noise = learn_profile(field, noise, stars, varying, **options)
+    log.info("own error of the varying PSF %.3f", noise.mismatch)
+    return varying if len(stars.x) >= MIN_STARS else profile

@@ -1,0 +1,256 @@
+"""Images without the models of their stars, strip by strip."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from wpdc_gwcs.centroids._fit import Stars
+from wpdc_gwcs.centroids._profile import Profile
+
+__all__ = ["Painter", "Residual", "Scene"]
+
+# Pixels of an image that are worked on at a time: they stay in the cache.
+_STRIP = 3_000_000
+
+# Half-widths in px that stars are drawn with, up to that of the profile: faint ones are smaller.
+_SIZES = (3, 5, 8, 12)
+# Light in the wings that may be left out, in standard deviations of the sky.
+_FAINTEST = 0.1
+
+# Light of neighbors, in standard deviations of the sky, that does not matter to a fit; and relative
+# to the light in the pixel.
+_NEGLIGIBLE, _SHARE = 0.05, 0.01
+# The same for a change of that light.
+_SETTLED = 0.02
+
+# Error of the PSF, relative, below which a residual is no sign of another star.
+_MODEL_ERROR = 0.1
+
+
+class Painter:
+    """Makes models of stars, each as large as its light can be told from the noise.
+
+    Parameters
+    ----------
+    profile : Profile
+        The PSF.
+    rms : (ny, nx) ndarray
+        Noise of the background.
+    """
+
+    def __init__(self, profile, rms):
+        self.profile = profile
+        samples = np.abs(profile.samples()).max(axis=0)
+        center = samples.shape[0] // 2
+        full = profile.radius - 1
+        # Greatest value at or beyond every distance along the axes.
+        distance = np.abs(np.arange(samples.shape[0]) - center) / profile.oversampling
+        line = np.maximum(samples[center], samples[:, center])
+        self._sizes = np.unique(np.minimum([*_SIZES, full], full))
+        self._levels = np.array([line[distance >= size].max() for size in self._sizes[:-1]])
+        step = max(1, min(rms.shape) // 500)
+        self._faintest = _FAINTEST * float(np.median(rms[::step, ::step]))
+
+    def half(self, flux):
+        """Find how large stars are drawn.
+
+        Parameters
+        ----------
+        flux : (N,) ndarray
+            Their fluxes.
+
+        Returns
+        -------
+        (N,) ndarray of int
+            Half-widths in px.
+        """
+        light = np.abs(flux)[:, None] * self._levels
+        return self._sizes[(light > self._faintest).sum(axis=1)]
+
+    def models(self, stars):
+        """Make models of stars.
+
+        Parameters
+        ----------
+        stars : Stars
+            The stars; a negative flux takes light off.
+
+        Returns
+        -------
+        list of Models
+            Those of each size.
+        """
+        half = self.half(stars.flux)
+        groups = (stars.take((half == size) & (stars.flux != 0)) for size in self._sizes)
+        pairs = zip(groups, self._sizes, strict=True)
+        return [self.profile.models(*group, size) for group, size in pairs if len(group.x)]
+
+
+def _paint(image, models, first_row):
+    """Make an image of models."""
+    image.fill(0)
+    for one in models:
+        one.paint(image, first_row=first_row)
+    return image
+
+
+class Scene:
+    """An image from which the models of stars are taken off as they are found.
+
+    Parameters
+    ----------
+    data : Field
+        The pixels; its image is changed.
+    profile : Profile
+        The PSF.
+    drawn : Stars
+        The stars whose models have been taken off; flux 0 for those without.
+
+    Notes
+    -----
+    Only what has changed is drawn, in strips: there is no image of all models.
+    """
+
+    def __init__(self, data, profile, drawn):
+        self.field = data
+        self.drawn = drawn
+        self._painter = Painter(profile, data.rms)
+
+    @property
+    def own(self):
+        """Models that stars get back for their fits, None where nothing has been taken off."""
+        return self.drawn if self.drawn.flux.any() else None
+
+    def draw(self, stars, radius):
+        """Take stars off the image instead of what they were before.
+
+        Parameters
+        ----------
+        stars : Stars
+            The same stars with new positions and fluxes; flux 0 for those that are not drawn.
+        radius : float
+            Radius in px of the pixels of a fit.
+
+        Returns
+        -------
+        (n,) ndarray of int
+            Rows of the stars in whose pixels the light of others has changed.
+        """
+        old, settled = self.drawn, _SETTLED if self.own is not None else _NEGLIGIBLE
+        changed = np.any([a != b for a, b in zip(old, stars, strict=True)], axis=0)
+        self.drawn = stars
+        if not changed.any():
+            return np.zeros(0, int)
+        gone, come = old.take(changed), stars.take(changed)
+        both = Stars(*map(np.concatenate, zip(gone._replace(flux=-gone.flux), come, strict=True)))
+        models, image = self._painter.models(both), self.field.image
+        margin = int(np.ceil(radius))
+        candidates = _near_any(stars, changed, self._painter.half(both.flux).max() + margin + 1)
+        row = np.clip(np.rint(stars.y[candidates]), 0, len(image) - 1)
+        candidates, row = candidates[order := np.argsort(row)], row[order]
+        step = max(1, _STRIP // image.shape[1])
+        work = np.empty((step + 2 * margin, image.shape[1]), np.float32)
+        found = [np.zeros(0, int)]
+        for first in range(0, len(image), step):
+            last = min(first + step, len(image))
+            low, high = max(first - margin, 0), min(last + margin, len(image))
+            light = _paint(work[: high - low], models, low)
+            image[first:last] -= light[first - low : last - low]
+            k = candidates[slice(*np.searchsorted(row, [first, last]))]
+            if len(k):
+                sides = old.take(k), stars.take(k)
+                found.append(k[self._disturbed(light, low, *sides, changed[k], radius, settled)])
+        return np.sort(np.concatenate(found))
+
+    def _disturbed(self, light, low, old, new, changed, radius, settled):
+        """Mark the stars in whose pixels there is light that is not their own."""
+        half = int(np.ceil(radius))
+        part = self.field.rows(low, low + len(light), image=light)
+        at = new._replace(y=new.y - low)
+        xc, yc, pixels, use, sky = part.cut(at, half, radius)
+        others = pixels.copy()
+        profile = self._painter.profile
+        for sign, side in ((-1, new), (1, old)):
+            k = np.flatnonzero(changed & (side.flux > 0))
+            if len(k):
+                others[k] += sign * side.take(k).light(profile, xc[k], yc[k] + low, half)
+        limit = settled * (np.sqrt(sky.variance) + _SHARE * np.abs(pixels))
+        return (use & (np.abs(others) > limit)).any(axis=1)
+
+
+def _near_any(stars, changed, reach):
+    """Rows of the stars that have another one that has changed within reach along both axes."""
+    places = np.column_stack([stars.x, stars.y])
+    options = {"k": 2, "p": np.inf, "distance_upper_bound": reach}
+    distance = KDTree(places[changed]).query(places, **options)[0]
+    return np.flatnonzero(np.isfinite(np.where(changed, distance[:, 1], distance[:, 0])))
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """An image without its stars, of which parts are made when they are asked for.
+
+    Parameters
+    ----------
+    background : Background
+        Image without background.
+    profile : Profile
+        The PSF.
+    stars : Stars
+        The stars.
+    gain : float or None
+        Electrons per unit of the image.
+    subtracted : bool
+        Whether the models have been taken off the image already.
+    """
+
+    background: object
+    profile: Profile
+    stars: Stars
+    gain: float | None
+    subtracted: bool
+
+    @cached_property
+    def _models(self):
+        return Painter(self.profile, self.background.rms).models(self.stars)
+
+    @property
+    def shape(self):
+        """Shape of the image, (ny, nx)."""
+        return self.background.shape
+
+    def rows(self, start, stop):
+        """Make some rows.
+
+        Parameters
+        ----------
+        start, stop : int
+            The first row, and the one behind the last.
+
+        Returns
+        -------
+        Background
+            The residual image.  Its ``rms`` is that of the background, of the stars' photons and
+            of an error of the PSF by 10 %: what stands out of it is no residual of a known star.
+        """
+        part = self.background.rows(start, stop)
+        image = part.image if self.subtracted else np.empty_like(part.image)
+        rms = np.empty(part.shape, np.float32)
+        # In strips: work space for whole images takes longer to be had than the work itself.
+        step = max(1, _STRIP // part.shape[1])
+        work = np.empty((min(step, len(rms)), part.shape[1]), np.float32)
+        for first in range(0, len(rms), step):
+            k = slice(first, min(first + step, len(rms)))
+            model = _paint(work[: k.stop - first], self._models, start + first)
+            variance = part.rms[k] ** 2 + (_MODEL_ERROR * model) ** 2
+            if self.gain is not None:
+                photons = np.maximum(model, 0) / self.gain
+                if part.photons is not None:
+                    photons *= part.photons[k]
+                variance += photons
+            np.sqrt(variance, out=rms[k])
+            if not self.subtracted:
+                np.subtract(part.image[k], model, out=image[k])
+        return replace(part, image=image, rms=rms)

@@ -1,0 +1,203 @@
+"""Fits of all stars in turn, their neighbors' light taken off, and what the neighbors cost."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from wpdc_gwcs.centroids._blends import judge_profiles, weigh_neighbors
+from wpdc_gwcs.centroids._build import isolated
+from wpdc_gwcs.centroids._fit import StarFits, Stars, fit_radius, fit_stars, star_like
+from wpdc_gwcs.centroids._modes import blur_modes, mode_profiles
+from wpdc_gwcs.centroids._noise import Noise, bin_noise, estimate_noise
+from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EXTENDED, FLAG_SATURATED
+from wpdc_gwcs.threads import one_blas_thread
+
+__all__ = ["MAX_CHI2", "fit_all", "judge_neighbors", "near", "noise_bins"]
+
+log = logging.getLogger(__name__)
+
+# Stars whose residuals tell the error of the PSF.
+_MAX_STARS = 1000
+_ENOUGH_ALONE = 50
+# Reduced chi square, absolute and relative to that of sources as bright, from which a source is
+# not a star.
+MAX_CHI2 = 4.0
+# Relative error of a neighbor's light beside its core: what any PSF is known to at best, what that
+# of a saturated star is, whose flux comes from its wings, and that of a source that has no model.
+_LEAST_ERROR, _SATURATED_ERROR, _NO_MODEL = 0.02, 0.2, 1.0
+# A star is blended where its neighbors cost it more than this many times the error it would have
+# alone, and more than so many px.
+_MAX_COST, _TOLERATED_COST = 1.5, 0.01
+
+
+def noise_bins(field, profile, stars, quality, fwhm, gain, *, own=None):
+    """Measure the noise in the brightest stars of good quality.
+
+    Parameters
+    ----------
+    field, profile
+        As for `fit_stars`.
+    stars : Stars
+        All stars.
+    quality : (N,) ndarray of bool
+        True for those of good quality.
+    fwhm : float
+        FWHM in px.
+    gain : float or None
+        Electrons per unit of the image.
+    own : Stars, optional
+        Models of these stars were subtracted from the image.
+
+    Returns
+    -------
+    bins : NoiseBins or None
+        As from `bin_noise`.
+    n : int
+        How many stars they are of.
+    """
+    radius = fit_radius(fwhm)
+    noise = Noise(0.0 if gain is None else 1 / gain)
+    good = quality & (stars.flux > 0)
+    # Neighbors' light is no noise, if enough stars have none.
+    alone = good & isolated(stars, fwhm)
+    rows = np.flatnonzero(alone if alone.sum() >= _ENOUGH_ALONE else good)
+    rows = rows[np.argsort(stars.flux[rows])[::-1][:_MAX_STARS]]
+    own = None if own is None else own.take(rows)
+    fits = fit_stars(field, profile, noise, stars.take(rows), radius=radius, own=own)
+    clean = star_like(fits.stars.flux, fits.chi2, fits.valid)
+    # A star that is a little broader or sharper than others has no worse position.
+    blur = blur_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)
+    bins = bin_noise(
+        field,
+        profile,
+        noise,
+        fits.stars.take(clean),
+        radius=radius,
+        modes=mode_profiles(blur[:3], profile.oversampling),
+        own=None if own is None else own.take(clean),
+    )
+    return bins, int(clean.sum())
+
+
+@one_blas_thread
+def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
+    """Fit all stars in turn.
+
+    Parameters
+    ----------
+    scene : Scene
+        The pixels; in the end without the stars.
+    profile : Profile
+        The PSF.
+    stars : Stars
+        Start values.
+    quality : (N,) ndarray of bool
+        True for stars of good quality, which tell the noise.
+    fwhm : float
+        FWHM in px.
+    gain : float or None
+        Electrons per unit of the image.
+    passes : int
+        Rounds at most.
+    refit : bool
+        Whether neighbors are taken off from the first round on.
+
+    Returns
+    -------
+    fits : StarFits
+        The fits, each with the covariance of the star alone.
+    noise : Noise
+        Noise of the pixels.
+    """
+    radius = fit_radius(fwhm)
+    bins, _ = noise_bins(scene.field, profile, stars, quality, fwhm, gain, own=scene.own)
+    noise = estimate_noise(bins, gain)
+    log.info("noise of the fits: %s", noise)
+    fits, rows = StarFits.unfitted(stars), np.arange(len(stars.x))
+    if refit:
+        scene.draw(_modelled(fits, stars, fwhm), radius)
+    for k in range(passes):
+        start = _modelled(fits, stars, fwhm).take(rows) if k or refit else stars
+        own = None if scene.own is None else scene.own.take(rows)
+        again = fit_stars(scene.field, profile, noise, start, radius=radius, own=own)
+        fits = fits.updated(rows, again)
+        rows = scene.draw(_modelled(fits, stars, fwhm), radius)
+        log.debug("round %d: the light beside %d stars has changed", k, len(rows))
+        if len(rows) == 0:
+            break
+    return fits, noise
+
+
+@one_blas_thread
+def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
+    """Find what neighbors cost the fits, and who is broader than a star.
+
+    Parameters
+    ----------
+    scene : Scene
+        The pixels without the stars.
+    profile : Profile
+        The PSF.
+    noise : Noise
+        Noise of the pixels.
+    fits : StarFits
+        The fits.
+    start : Stars
+        Where they began.
+    flags : (N,) ndarray of int
+        Flags of the sources.
+    fwhm : float
+        FWHM in px.
+
+    Returns
+    -------
+    fits : StarFits
+        With the covariance of all stars together.
+    shift : (N,) ndarray
+        Error of the positions in px by what is wrong in the models of neighbors.
+    flags : (N,) ndarray of int
+        Flags.
+    """
+    radius, field, own = fit_radius(fwhm), scene.field, scene.drawn
+    fitted = own.flux > 0
+    clean = (flags == 0) & star_like(own.flux, fits.chi2, fitted, limit=MAX_CHI2)
+    broad, excess = judge_profiles(field, profile, noise, own, clean, fwhm, radius, subtracted=True)
+    unsure = np.where(flags & FLAG_SATURATED, _SATURATED_ERROR, max(_LEAST_ERROR, noise.mismatch))
+    all_light = own._replace(flux=np.where(fitted, own.flux, np.maximum(start.flux, 0)))
+    alone = np.where(fitted[:, None, None], fits.covariance, np.nan)
+    joint, shift = weigh_neighbors(
+        field, profile, noise, all_light, alone, radius, np.where(fitted, unsure, _NO_MODEL)
+    )
+    before, after = (np.sqrt(c[:, 0, 0] + c[:, 1, 1]) for c in (alone, joint))
+    error = np.hypot(after, shift)
+    blended = ~(error < np.maximum(_MAX_COST * before, _TOLERATED_COST)) & fitted
+    flags = np.where(fitted, flags & ~FLAG_BLENDED, flags)
+    flags |= np.where(blended, FLAG_BLENDED, 0) | np.where(broad, FLAG_EXTENDED, 0)
+    joint = np.where(np.isfinite(joint), joint, alone)
+    return replace(fits, covariance=joint, chi2=fits.chi2 - excess), shift, flags
+
+
+def _modelled(fits, start, fwhm):
+    """Stars as fitted; without a flux, and where they were, those without a fit."""
+    good = fits.valid & near(fits.stars, start, fwhm)
+    x, y, flux = (np.where(good, new, old) for new, old in zip(fits.stars, start, strict=True))
+    return Stars(x, y, np.where(good, flux, 0.0))
+
+
+def near(stars, start, fwhm):
+    """Mark the fits that stayed with the source they began at.
+
+    Parameters
+    ----------
+    stars, start : Stars
+        As fitted, and where the fits began.
+    fwhm : float
+        FWHM in px.
+
+    Returns
+    -------
+    (N,) ndarray of bool
+        True for those that did.
+    """
+    return np.hypot(stars.x - start.x, stars.y - start.y) < max(0.5 * fwhm, 1.0)
