@@ -16,7 +16,7 @@ from wpdc_gwcs.calibration.start import (
     linear_wcs,
     sky_of,
 )
-from wpdc_gwcs.catalogs import fill_motions, propagate, read_catalog, select_cone
+from wpdc_gwcs.catalogs import fill_motions, propagate, read_catalog, scale_errors, select_cone
 from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
@@ -276,4 +276,5 @@ def reference_in_reach(frame, catalog, start, settings):
             f"{frame.source}: the catalog has no star within {radius:.3f} deg of the frame's "
             f"center, RA {ra:.4f} Dec {dec:.4f} deg"
         )
+    near = scale_errors(near)
     return near if frame.epoch is None else propagate(near, frame.epoch, parallax=True)

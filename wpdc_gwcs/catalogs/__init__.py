@@ -23,9 +23,9 @@ column                unit     meaning
 ``bp_rp``             mag      a color, NaN where unknown
 ``ra_error``, ...     mas      errors of ``ra`` (times cos Dec), ``dec``, ``pmra``, ``pmdec``,
                                ``parallax``; NaN where unknown
-``ra_pmra_corr``      --       correlation of the errors of ``ra`` and ``pmra``; likewise
-                               ``dec_pmdec_corr``
-``ra_dec_corr``       --       correlation of the errors of ``ra`` and ``dec``
+``ra_dec_corr``, ...  --       correlations of the errors of ``ra``, ``dec``, ``pmra`` and ``pmdec``
+``radial_velocity``   km / s   NaN where unknown
+``ruwe``              --       of Gaia; above 1.4 it scales the errors, see `scale_errors`
 ``catalog_index``     --       row of the input, zero based
 ``pm_from_neighbors`` --       true where `fill_motions` filled the motion
 ===================== ======== =================================================================
@@ -41,6 +41,7 @@ from wpdc_gwcs.catalogs.files import (
     split_extension,
 )
 from wpdc_gwcs.catalogs.motions import fill_motions, propagate
+from wpdc_gwcs.catalogs.quality import scale_errors
 from wpdc_gwcs.catalogs.standard import read_catalog
 
 __all__ = [
@@ -51,6 +52,7 @@ __all__ = [
     "read_catalog",
     "read_lines",
     "read_table_file",
+    "scale_errors",
     "select_cone",
     "special_file",
     "split_extension",

@@ -48,7 +48,12 @@ _OPTIONAL = {
     "parallax_error": ("parallax_error", "e_plx", "e_parallax"),
     "ra_dec_corr": ("ra_dec_corr", "radecor"),
     "ra_pmra_corr": ("ra_pmra_corr", "rapmracor"),
+    "ra_pmdec_corr": ("ra_pmdec_corr", "rapmdecor"),
+    "dec_pmra_corr": ("dec_pmra_corr", "depmracor"),
     "dec_pmdec_corr": ("dec_pmdec_corr", "depmdecor"),
+    "pmra_pmdec_corr": ("pmra_pmdec_corr", "pmrapmdecor"),
+    "radial_velocity": ("radial_velocity", "dr2_radial_velocity", "rv", "rvel"),
+    "ruwe": ("ruwe",),
 }
 _MAGNITUDES = (
     "phot_g_mean_mag",
