@@ -2,7 +2,7 @@
 
 ::
 
-    file or table --read_catalog--> checked table --fill_motions--> all stars with a motion
+    file, table, archive --read_catalog--> checked table --fill_motions--> all stars with a motion
                                                   --select_cone--> near the frame
                                                   --propagate--> at the epoch of the frame
 
@@ -40,13 +40,22 @@ from wpdc_gwcs.catalogs.files import (
     special_file,
     split_extension,
 )
+from wpdc_gwcs.catalogs.gaia import GaiaArchive
+from wpdc_gwcs.catalogs.hats import HatsCatalog
 from wpdc_gwcs.catalogs.motions import fill_motions, propagate
 from wpdc_gwcs.catalogs.quality import scale_errors
-from wpdc_gwcs.catalogs.standard import read_catalog
+from wpdc_gwcs.catalogs.region import Region
+from wpdc_gwcs.catalogs.sources import catalog_source
+from wpdc_gwcs.catalogs.standard import identity_of, read_catalog
 
 __all__ = [
     "READ_ERRORS",
+    "GaiaArchive",
+    "HatsCatalog",
+    "Region",
+    "catalog_source",
     "fill_motions",
+    "identity_of",
     "is_fits",
     "propagate",
     "read_catalog",

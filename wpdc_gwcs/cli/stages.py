@@ -134,7 +134,6 @@ def match_command(
     import numpy as np
 
     from wpdc_gwcs.calibration import Settings, match_frame
-    from wpdc_gwcs.catalogs import read_catalog
     from wpdc_gwcs.io import write_table
     from wpdc_gwcs.matching import pair_table
 
@@ -153,9 +152,8 @@ def match_command(
     given = by_hand(epoch, pixel_scale, origin)
     given |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
     one = one_frame(frame, wcs=wcs, **given)
-    reference = read_catalog(catalog)
-    matched = match_frame(one, reference, settings)
-    if one.epoch is None and "pmra" in reference.colnames:
+    matched = match_frame(one, catalog, settings)
+    if one.epoch is None and "pmra" in matched.reference.colnames:
         log.warning("%s has no epoch: the stars' motions were not applied (--epoch)", one.source)
     i, j = matched.pairs
     x, y = (np.asarray(matched.sources[name], float)[i] for name in ("x", "y"))
