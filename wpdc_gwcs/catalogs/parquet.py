@@ -4,11 +4,11 @@ from functools import partial
 
 import numpy as np
 from astropy.table import MaskedColumn, Table
-from astropy.table.meta import get_header_from_yaml
+from astropy.table.meta import get_header_from_yaml, get_yaml_from_table
 
 from wpdc_gwcs.catalogs.extras import require
 
-__all__ = ["LazyColumns", "parquet_groups", "read_parquet"]
+__all__ = ["LazyColumns", "parquet_groups", "read_parquet", "write_parquet"]
 
 
 class LazyColumns:
@@ -56,6 +56,28 @@ def read_parquet(path):
 
     with parquet.ParquetFile(path) as file:
         return _arrow_table(file.read(), _astropy_header(file.schema_arrow.metadata))
+
+
+def write_parquet(table, path):
+    """Write a table, with its units as astropy would write them.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        Plain columns.
+    path : path-like
+        File to write.
+    """
+    import pyarrow
+    from pyarrow import parquet
+
+    columns = {}
+    for name in table.colnames:
+        values = np.asarray(table[name])
+        columns[name] = values.astype(values.dtype.newbyteorder("="))
+    text = "\n".join(get_yaml_from_table(table)).encode()
+    arrow = pyarrow.table(columns).replace_schema_metadata({"table_meta_yaml": text})
+    parquet.write_table(arrow, path)
 
 
 def parquet_groups(paths, known):
