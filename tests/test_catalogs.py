@@ -15,7 +15,13 @@ from astropy.time import Time
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from wpdc_gwcs.catalogs import fill_motions, propagate, read_catalog, select_cone
+from wpdc_gwcs.catalogs import (
+    fill_motions,
+    propagate,
+    read_catalog,
+    scale_errors,
+    select_cone,
+)
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
 
 
@@ -481,6 +487,74 @@ def test_errors_and_correlations_are_those_of_drawn_stars():
     np.testing.assert_allclose(
         [back["ra_pmra_corr"][0], back["dec_pmdec_corr"][0]], [rho, 0], atol=1e-9
     )
+
+
+def test_all_correlations_are_those_of_drawn_stars():
+    names, years = ("ra", "dec", "pmra", "pmdec"), 9.0
+    errors = np.array([2.0, 1.5, 0.3, 0.2])
+    rho = np.array(
+        [[1.0, 0.4, -0.3, 0.5], [0.4, 1.0, 0.2, -0.4], [-0.3, 0.2, 1.0, -0.6], [0.5, -0.4, -0.6, 1]]
+    )
+    table = Table({"ra": [1.0], "dec": [0.0], "pmra": [5.0], "pmdec": [-3.0]})
+    table["ref_epoch"] = 2016.0
+    for k, one in enumerate(names):
+        table[f"{one}_error"] = errors[k]
+        for m in range(k):
+            table[f"{names[m]}_{one}_corr"] = rho[m, k]
+    moved = propagate(read_catalog(table), 2016.0 + years)
+    drawn = np.random.default_rng(3).multivariate_normal(
+        np.zeros(4), rho * np.outer(errors, errors), 400_000
+    )
+    drawn[:, :2] += years * drawn[:, 2:]
+    expected = np.corrcoef(drawn.T)
+    for k, one in enumerate(names):
+        for m in range(k):
+            found = moved[f"{names[m]}_{one}_corr"][0]
+            assert found == pytest.approx(expected[m, k], abs=0.01), (names[m], one)
+    back = propagate(moved, 2016.0)
+    assert back["ra_dec_corr"][0] == pytest.approx(0.4, abs=1e-9)
+    # Where no error is known, the correlation is what was given.
+    table.remove_columns(["ra_error", "pmra_error"])
+    assert propagate(read_catalog(table), 2025.0)["ra_dec_corr"][0] == 0.4
+
+
+def test_radial_velocity_is_that_of_astropy():
+    # Barnard's star, and one without a parallax of use
+    table = Table({"ra": [269.4521, 269.5], "dec": [4.6934, 4.7]})
+    table["pmra"], table["pmdec"], table["ref_epoch"] = [-801.551, 0.0], [10362.394, 50.0], 2016.0
+    table["parallax"], table["parallax_error"] = [546.9759, -0.1], [0.04, 0.1]
+    table["radial_velocity"] = [-110.47, 300.0]
+    moved = propagate(read_catalog(table), 2066.0)
+    star = SkyCoord(
+        269.4521 * u.deg,
+        4.6934 * u.deg,
+        distance=1000 / 546.9759 * u.pc,
+        pm_ra_cosdec=-801.551 * u.mas / u.yr,
+        pm_dec=10362.394 * u.mas / u.yr,
+        radial_velocity=-110.47 * u.km / u.s,
+        obstime=Time(2016.0, format="jyear", scale="tdb"),
+    ).apply_space_motion(Time(2066.0, format="jyear", scale="tdb"))
+    got = SkyCoord(moved["ra"], moved["dec"], unit="deg")
+    assert got[0].separation(star).mas < 0.5
+    table.remove_column("radial_velocity")
+    without = propagate(read_catalog(table), 2066.0)
+    still = SkyCoord(without["ra"], without["dec"], unit="deg")
+    assert 1400 < still[0].separation(star).mas < 1800  # 1.2 mas / yr2
+    assert got[1].separation(still[1]).mas == 0
+
+
+def test_errors_of_bad_fits_are_scaled():
+    table = Table({"ra": [1.0, 2.0, 3.0], "dec": [0.0] * 3, "ruwe": [1.39, 2.5, np.nan]})
+    table["ra_error"] = table["pmra_error"] = 0.2
+    catalog = read_catalog(table)
+    scaled = scale_errors(catalog)
+    for name in ("ra_error", "pmra_error"):
+        np.testing.assert_allclose(scaled[name], [0.2, 0.5, 0.2])
+        assert list(catalog[name]) == [0.2] * 3
+        assert scaled[name].unit == catalog[name].unit
+    table.remove_column("ruwe")
+    plain = read_catalog(table)
+    assert scale_errors(plain) is plain
 
 
 def test_unknown_errors_do_not_hide_the_known():

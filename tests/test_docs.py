@@ -13,7 +13,17 @@ from wpdc_gwcs.calibration import Settings
 from wpdc_gwcs.cli import app
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-COMMANDS = typer.main.get_command(app).commands
+
+
+def commands_of(group, name=""):
+    """Commands by name, those of groups by both names."""
+    if not hasattr(group, "commands"):
+        return {name: group}
+    found = (commands_of(c, f"{name} {n}".strip()) for n, c in group.commands.items())
+    return {n: c for commands in found for n, c in commands.items()}
+
+
+COMMANDS = commands_of(typer.main.get_command(app))
 
 
 def read_page(name):
@@ -22,7 +32,7 @@ def read_page(name):
 
 def cli_sections():
     """Text of the page by command."""
-    parts = re.split(r"^\.\. program:: wpdc (\S+)$", read_page("reference/cli.rst"), flags=re.M)
+    parts = re.split(r"^\.\. program:: wpdc (.+)$", read_page("reference/cli.rst"), flags=re.M)
     return dict(zip(parts[1::2], parts[2::2], strict=True))
 
 

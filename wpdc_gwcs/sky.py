@@ -7,6 +7,7 @@ __all__ = [
     "annual_parallax",
     "directions",
     "move",
+    "radial_motion",
 ]
 
 
@@ -50,8 +51,8 @@ def angles(vector):
     return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
-def move(ra, dec, pmra, pmdec, years):
-    """Move stars straight on in space, with a radial velocity of zero.
+def move(ra, dec, pmra, pmdec, years, *, radial=0.0):
+    """Move stars straight on in space.
 
     Parameters
     ----------
@@ -61,6 +62,8 @@ def move(ra, dec, pmra, pmdec, years):
         Proper motions, mas / yr; that in right ascension includes cos Dec.
     years : (N,) ndarray or float
         How long, yr.
+    radial : (N,) ndarray or float, optional
+        Radial velocity over distance, mas / yr: as `radial_motion` gives it.
 
     Returns
     -------
@@ -71,7 +74,7 @@ def move(ra, dec, pmra, pmdec, years):
     """
     r, east, north = directions(ra, dec)
     mas = np.pi / 180.0 / 3.6e6
-    motion = (pmra * east + pmdec * north) * mas
+    motion = (pmra * east + pmdec * north + radial * r) * mas
     later = r + motion * years
     length = np.sqrt((later**2).sum(axis=0))
     new = later / length
@@ -84,6 +87,25 @@ def move(ra, dec, pmra, pmdec, years):
         (motion * east).sum(axis=0) / mas,
         (motion * north).sum(axis=0) / mas,
     )
+
+
+def radial_motion(velocity, parallax):
+    """Radial velocity as a motion, in the unit of proper motions.
+
+    Parameters
+    ----------
+    velocity : (N,) array_like
+        Radial velocity, km / s; positive away from the Sun.
+    parallax : (N,) array_like
+        Parallax, mas.
+
+    Returns
+    -------
+    (N,) ndarray
+        Share of the distance covered in a year, mas / yr; zero where one of the two is not known.
+    """
+    # 1 au / yr is 4.740470446 km / s: over a parallax in mas this is mas / yr.
+    return np.nan_to_num(np.asarray(velocity) * np.maximum(parallax, 0.0) / 4.740470446)
 
 
 def annual_parallax(ra, dec, parallax, epoch):

@@ -14,6 +14,7 @@ import numpy as np
 
 from wpdc_gwcs import exceptions
 from wpdc_gwcs.calibration.start import sky_of
+from wpdc_gwcs.catalogs import identity_of
 from wpdc_gwcs.exceptions import FileFormatError, FrameFailure, InternalError
 
 __all__ = ["Manifest", "files_of", "frame_sum", "plan_run", "read_manifest"]
@@ -205,7 +206,7 @@ def plan_run(run_id, groups, *, settings, catalog, catalog_path, solution, updat
         },
         # As it is read back.
         settings=json.loads(json.dumps(dataclasses.asdict(settings), default=repr)),
-        catalog={"rows": len(catalog), "sum": _sum_of_table(catalog)},
+        catalog=_sum_of_catalog(catalog),
         solution=None if solution is None else _sum_of_solution(solution),
         update=bool(update),
         inputs=[_state_of(file) for file in files if file.is_file()],
@@ -311,6 +312,14 @@ def _state_of(file):
         "size": stat.st_size,
         "modified": datetime.fromtimestamp(stat.st_mtime_ns / 1e9, UTC).isoformat(),
     }
+
+
+def _sum_of_catalog(catalog):
+    """Identify a catalog; a part, which is another one for other frames, by what it is of."""
+    identity = identity_of(catalog)
+    if identity is not None:
+        return {"part_of": identity}
+    return {"rows": len(catalog), "sum": _sum_of_table(catalog)}
 
 
 def _sum_of_table(table):

@@ -16,7 +16,15 @@ from wpdc_gwcs.calibration.start import (
     linear_wcs,
     sky_of,
 )
-from wpdc_gwcs.catalogs import fill_motions, propagate, read_catalog, select_cone
+from wpdc_gwcs.catalogs import (
+    Region,
+    catalog_source,
+    fill_motions,
+    propagate,
+    read_catalog,
+    scale_errors,
+    select_cone,
+)
 from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
@@ -27,6 +35,7 @@ __all__ = [
     "FailedFrame",
     "MatchedFrame",
     "catalog_of_frame",
+    "sky_of_frame",
     "match_frame",
     "reference_in_reach",
     "usable_sources",
@@ -85,7 +94,7 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     ----------
     frame : Frame
         Image or source list.
-    catalog : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
+    catalog : path-like, Table, SkyCoord, GaiaArchive or HatsCatalog
         Reference catalog: what `read_catalog` takes, or has returned.
     settings : Settings, optional
         Choices; the defaults work for any camera.
@@ -107,7 +116,9 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     settings = Settings() if settings is None else settings
     began = time.perf_counter()
     if "catalog_index" not in getattr(catalog, "colnames", ()):
-        catalog = read_catalog(catalog)
+        source = catalog_source(catalog, max_mag=settings.max_mag)
+        sky = sky_of_frame(frame, settings, solution=solution)
+        catalog = read_catalog(source, region=None if sky is None else Region(*sky))
     if sources is None:
         sources = measure_sources(frame, settings)
     announce("matching")
@@ -222,6 +233,34 @@ def _reach(frame, start, settings):
     return ra, dec, (np.hypot(nx, ny) / 2 + margin) * start.scale
 
 
+def sky_of_frame(frame, settings, *, solution=None):
+    """Tell where on the sky the stars of a frame are, and those that others may need to find it.
+
+    Parameters
+    ----------
+    frame : Frame
+        Its WCS tells where.
+    settings : Settings
+        A blind search needs more.
+    solution : DistortionSolution, optional
+        Stored solution of the detector.
+
+    Returns
+    -------
+    tuple of float or None
+        Center and radius, deg; `None` of a frame whose WCS does not tell, which fails by itself.
+    """
+    try:
+        ra, dec, radius = _reach(frame, _start(frame, solution), settings)
+    except Exception:  # noqa: BLE001  Any WCS may be handed in, and what is wrong is told later.
+        return None
+    if not (np.isfinite([ra, dec, radius]).all() and radius < 180):
+        return None
+    # A frame whose header is worse is looked for around its neighbors, and a star of no known
+    # motion moves with the thirty that are nearest to it, wherever it is.
+    return ra, dec, 1.25 * radius + 0.1
+
+
 def catalog_of_frame(frame, catalog, settings, *, solution=None):
     """Cut the reference catalog to what a frame can need, to be handed to another process.
 
@@ -278,4 +317,5 @@ def reference_in_reach(frame, catalog, start, settings):
             f"{frame.source}: the catalog has no star within {radius:.3f} deg of the frame's "
             f"center, RA {ra:.4f} Dec {dec:.4f} deg"
         )
+    near = scale_errors(near)
     return near if frame.epoch is None else propagate(near, frame.epoch, parallax=True)

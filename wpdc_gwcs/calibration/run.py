@@ -15,14 +15,20 @@ from astropy.table import QTable, Table
 from wpdc_gwcs.calibration.camera import cameras_of, solve_camera
 from wpdc_gwcs.calibration.exposures import tie_exposures
 from wpdc_gwcs.calibration.manifest import plan_run
-from wpdc_gwcs.calibration.matched import FailedFrame
+from wpdc_gwcs.calibration.matched import FailedFrame, sky_of_frame
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.results import Outcome, ResultFolder
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.summary import summarize, summary_row
 from wpdc_gwcs.calibration.workers import Task, Workers, internal_error, stored_of
 from wpdc_gwcs.camera import build_camera
-from wpdc_gwcs.catalogs import fill_motions, read_catalog, split_extension
+from wpdc_gwcs.catalogs import (
+    Region,
+    catalog_source,
+    fill_motions,
+    read_catalog,
+    split_extension,
+)
 from wpdc_gwcs.exceptions import (
     ClusterError,
     DuplicateFrameError,
@@ -100,8 +106,9 @@ def calibrate(
     ----------
     frames : Frame or iterable of Frame
         What `wpdc_gwcs.io.read_frames` returns; names must be unique.
-    catalog : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
-        Reference catalog: whatever `read_catalog` takes, and what it returned.
+    catalog : path-like, Table, SkyCoord, GaiaArchive or HatsCatalog
+        Reference catalog: whatever `read_catalog` takes, and what it returned; of ``"gaia"``,
+        ``"hats:PATH"`` and large files, the part about the frames is read.
     solution : DistortionSolution, Camera or mapping, optional
         Stored solution (of a camera, or detector name to solution): its distortion is kept; each
         frame gets its attitude, and a field where its stars speak for one.
@@ -172,11 +179,15 @@ def calibrate(
     groups = cameras_of(frames)
     folder = None if output is None else ResultFolder(output, overwrite=overwrite, resume=resume)
     with folder or nullcontext(), listening(lambda stage: progress(stage, 0, 0)):
+        catalog = catalog_source(catalog, max_mag=settings.max_mag)
         path = catalog if isinstance(catalog, str | os.PathLike) else None
         # Before the catalog, which may take a while.
         if folder is not None:
             folder.check(groups, inputs=[] if path is None else [split_extension(path)[0]])
-        catalog = read_catalog(catalog)
+        # What is in memory is there as a whole.
+        whole = path is None and not hasattr(catalog, "stars_of")
+        region = None if whole else _sky_of(frames, settings, solution)
+        catalog = read_catalog(catalog, region=region)
         run_id = uuid.uuid4().hex[:12]
         if folder is not None:
             plan = plan_run(
@@ -205,6 +216,16 @@ def calibrate(
                     folder.write(group, outcome)
     resumed = tuple(frame.name for group in done for frame in group)
     return _joined(frames, list(outcomes.values()), run_id, resumed)
+
+
+def _sky_of(frames, settings, solution):
+    """Sky that the frames of a run cover; `None` where none of them tells."""
+    cones = [
+        sky_of_frame(frame, settings, solution=stored_of(solution, frame.detector))
+        for frame in frames
+    ]
+    cones = [cone for cone in cones if cone is not None]
+    return Region(*zip(*cones, strict=True)) if cones else None
 
 
 def _as_frames(frames):
@@ -460,5 +481,5 @@ def _holdout_mask(catalog, settings):
     """Rows of the catalog that are kept out of every fit, the same in all frames."""
     if settings.holdout == 0:
         return None
-    size = int(np.max(catalog["catalog_index"])) + 1
+    size = int(np.max(catalog["catalog_index"], initial=-1)) + 1
     return np.random.default_rng(settings.seed).uniform(size=size) < settings.holdout

@@ -2,7 +2,7 @@
 
 ::
 
-    file or table --read_catalog--> checked table --fill_motions--> all stars with a motion
+    file, table, archive --read_catalog--> checked table --fill_motions--> all stars with a motion
                                                   --select_cone--> near the frame
                                                   --propagate--> at the epoch of the frame
 
@@ -23,9 +23,9 @@ column                unit     meaning
 ``bp_rp``             mag      a color, NaN where unknown
 ``ra_error``, ...     mas      errors of ``ra`` (times cos Dec), ``dec``, ``pmra``, ``pmdec``,
                                ``parallax``; NaN where unknown
-``ra_pmra_corr``      --       correlation of the errors of ``ra`` and ``pmra``; likewise
-                               ``dec_pmdec_corr``
-``ra_dec_corr``       --       correlation of the errors of ``ra`` and ``dec``
+``ra_dec_corr``, ...  --       correlations of the errors of ``ra``, ``dec``, ``pmra`` and ``pmdec``
+``radial_velocity``   km / s   NaN where unknown
+``ruwe``              --       of Gaia; above 1.4 it scales the errors, see `scale_errors`
 ``catalog_index``     --       row of the input, zero based
 ``pm_from_neighbors`` --       true where `fill_motions` filled the motion
 ===================== ======== =================================================================
@@ -40,17 +40,28 @@ from wpdc_gwcs.catalogs.files import (
     special_file,
     split_extension,
 )
+from wpdc_gwcs.catalogs.gaia import GaiaArchive
+from wpdc_gwcs.catalogs.hats import HatsCatalog
 from wpdc_gwcs.catalogs.motions import fill_motions, propagate
-from wpdc_gwcs.catalogs.standard import read_catalog
+from wpdc_gwcs.catalogs.quality import scale_errors
+from wpdc_gwcs.catalogs.region import Region
+from wpdc_gwcs.catalogs.sources import catalog_source
+from wpdc_gwcs.catalogs.standard import identity_of, read_catalog
 
 __all__ = [
     "READ_ERRORS",
+    "GaiaArchive",
+    "HatsCatalog",
+    "Region",
+    "catalog_source",
     "fill_motions",
+    "identity_of",
     "is_fits",
     "propagate",
     "read_catalog",
     "read_lines",
     "read_table_file",
+    "scale_errors",
     "select_cone",
     "special_file",
     "split_extension",

@@ -8,9 +8,9 @@ import numpy as np
 from wpdc_gwcs.columns import find_name, read_numbers
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
 
-__all__ = ["reference_epochs"]
+__all__ = ["EPOCH_NAMES", "reference_epochs"]
 
-_EPOCHS = ("ref_epoch", "refepoch", "epoch", "obsdate")
+EPOCH_NAMES = ("ref_epoch", "refepoch", "epoch", "obsdate")
 # Releases that a header, a table name or a description may mention.
 _GAIA_EPOCHS = (
     (re.compile(r"gaia\s*[-_/]?\s*e?dr3|I[/_]35[05]", re.IGNORECASE), 2016.0),
@@ -53,7 +53,7 @@ def reference_epochs(table, spelled, position, name, *, has_motion):
     WPDCWarning
         If there are motions and nothing says at which epoch the positions are.
     """
-    found = find_name(spelled, _EPOCHS)
+    found = find_name(spelled, EPOCH_NAMES)
     epochs = None if found is None else _julian_years(table, found, name)
     fallback = _epoch_of_metadata(table, position)
     if epochs is None and fallback is not None:

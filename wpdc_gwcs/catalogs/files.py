@@ -18,9 +18,21 @@ from astropy.io.registry import IORegistryError
 from astropy.table import Table
 from yaml import YAMLError
 
+from wpdc_gwcs.catalogs.parquet import read_parquet
+from wpdc_gwcs.catalogs.positions import find_positions
+from wpdc_gwcs.columns import spelled_names
+from wpdc_gwcs.exceptions import CatalogError
+
 __all__ = [
     "READ_ERRORS",
+    "choose_table",
+    "csv_form",
+    "decode",
     "is_fits",
+    "open_any",
+    "parse_csv",
+    "parse_ecsv",
+    "plain_name",
     "read_lines",
     "read_table_file",
     "special_file",
@@ -50,7 +62,7 @@ READ_ERRORS = (
     zlib.error,
 )
 # Endings of tables that are no plain text: astropy finds out by itself.
-_FOREIGN = re.compile(r"\.(vot|votable|parquet|pq|xml|h5|hdf5|html?|asdf|mrt|feather)$")
+_FOREIGN = re.compile(r"\.(vot|votable|xml|h5|hdf5|html?|asdf|mrt|feather)$")
 _OPENERS = ((b"\x1f\x8b", gzip.open), (b"BZh", bz2.open), (b"\xfd7zXZ\x00", lzma.open))
 # Characters that no text has.
 _BINARY = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
@@ -127,8 +139,43 @@ def is_fits(path):
     bool
         By its first bytes.
     """
-    with _open(path) as file:
+    with open_any(path) as file:
         return file.read(9) == b"SIMPLE  ="
+
+
+def choose_table(hdus, path, extension=None):
+    """Choose the table of stars of a FITS file.
+
+    Parameters
+    ----------
+    hdus : `~astropy.io.fits.HDUList`
+        The file.
+    path : path-like
+        What messages call it.
+    extension : int or str, optional
+        The extension that was asked for; default: the first table that has positions.
+
+    Returns
+    -------
+    HDU
+        A table.
+
+    Raises
+    ------
+    CatalogError
+        If there is none.
+    """
+    kinds = fits.BinTableHDU | fits.TableHDU
+    if extension is not None:
+        if not isinstance(hdus[extension], kinds):
+            raise CatalogError(f"{path}[{extension}]: must be a table extension")
+        return hdus[extension]
+    tables = [h for h in hdus if isinstance(h, kinds)]
+    if not tables:
+        raise CatalogError(f"{path}: must have a table extension, has none")
+    # LDAC files have a header table first, others whatever their writer liked.
+    tables.sort(key=lambda h: find_positions(spelled_names(h.columns.names)) is None)
+    return tables[0]
 
 
 def read_table_file(path, format=None):
@@ -157,7 +204,9 @@ def read_table_file(path, format=None):
     text_format = format is not None and format.startswith("ascii")
     if format is not None and not text_format:
         return Table.read(path, format=format)
-    if not text_format and _FOREIGN.search(_plain_name(path)):
+    if re.search(r"\.(parquet|pq)$", plain_name(path)):
+        return read_parquet(path)
+    if not text_format and _FOREIGN.search(plain_name(path)):
         return Table.read(path, format="votable" if ".vot" in path.name.lower() else None)
     lines = read_lines(path)
     if not any(line.strip() for line in lines):
@@ -167,8 +216,8 @@ def read_table_file(path, format=None):
     if text_format:
         return Table.read(lines, format=format, fill_values=_FILL)
     if lines[0].startswith("# %ECSV"):
-        return _read_ecsv(lines)
-    if _plain_name(path).endswith((".csv", ".tsv")):
+        return parse_ecsv(lines)
+    if plain_name(path).endswith((".csv", ".tsv")):
         return _read_csv(lines)
     try:
         return Table.read(lines, format="ascii", fill_values=_FILL)
@@ -195,21 +244,62 @@ def read_lines(path):
     one of READ_ERRORS
         If the file cannot be read or is no text.
     """
-    with _open(path) as file:
-        return _decode(file.read()).splitlines()
+    with open_any(path) as file:
+        return decode(file.read()).splitlines()
 
 
-def _open(path):
+def open_any(path):
+    """Open a file to read bytes, whether it is compressed or not.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    file object
+        Of what is in it.
+    """
     with open(path, "rb") as file:
         start = file.read(6)
     return next((opener for mark, opener in _OPENERS if start.startswith(mark)), open)(path, "rb")
 
 
-def _plain_name(path):
+def plain_name(path):
+    """Name of a file in lower case, without what compression adds to it.
+
+    Parameters
+    ----------
+    path : `~pathlib.Path`
+        The file.
+
+    Returns
+    -------
+    str
+        Such as ``gaia.csv`` of ``Gaia.csv.gz``.
+    """
     return re.sub(r"\.(gz|bz2|xz)$", "", path.name.lower())
 
 
-def _decode(content):
+def decode(content):
+    """Make text of bytes.
+
+    Parameters
+    ----------
+    content : bytes
+        In UTF-8, with a byte-order mark, or in latin-1.
+
+    Returns
+    -------
+    str
+        The text.
+
+    Raises
+    ------
+    ValueError
+        If it is no text.
+    """
     encoding = next((e for mark, e in _MARKS if content.startswith(mark)), "utf-8")
     if encoding.startswith("utf-8") and _BINARY.search(content):
         raise ValueError("it is neither text nor a table of a known kind")
@@ -219,23 +309,73 @@ def _decode(content):
         return content.decode("latin-1")
 
 
+def csv_form(head, first):
+    """Tell the delimiter of CSV and its line of names, which may stand in a comment.
+
+    Parameters
+    ----------
+    head : list of str
+        Lines of comments before it.
+    first : str
+        First line that is no comment.
+
+    Returns
+    -------
+    delimiter : str
+        One of ``,;|`` and the tabulator.
+    names : str
+        The first line itself, unless a comment has the names.
+    """
+    delimiter = max(",;\t|", key=first.count)
+    if head and head[-1].count(delimiter) == first.count(delimiter) > 0:
+        names = head[-1].lstrip("# ").split(delimiter)
+        # a comment has the names if the first row has numbers
+        if any(re.match(r"[-+]?\d", cell.strip()) for cell in first.split(delimiter)) and all(
+            re.match(r"[A-Za-z_]", cell.strip(' "')) for cell in names
+        ):
+            return delimiter, head[-1].lstrip("# ")
+    return delimiter, first
+
+
+def parse_csv(lines, delimiter):
+    """Parse CSV.
+
+    Parameters
+    ----------
+    lines : list of str
+        Names and rows.
+    delimiter : str
+        What stands between cells.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        The table.
+    """
+    return Table.read(lines, format="ascii.csv", delimiter=delimiter, fill_values=_FILL)
+
+
 def _read_csv(lines):
     """Read CSV with any delimiter, comments before it, and names that may stand in a comment."""
     comments = next((k for k, line in enumerate(lines) if not line.startswith("#")), 0)
     head, rows = lines[:comments], [line for line in lines[comments:] if line.strip()]
-    delimiter = max(",;\t|", key=rows[0].count)
-    if head and head[-1].count(delimiter) == rows[0].count(delimiter) > 0:
-        names = head[-1].lstrip("# ").split(delimiter)
-        # a comment has the names if the first row has numbers
-        if any(re.match(r"[-+]?\d", cell.strip()) for cell in rows[0].split(delimiter)) and all(
-            re.match(r"[A-Za-z_]", cell.strip(' "')) for cell in names
-        ):
-            rows = [head[-1].lstrip("# "), *rows]
-    return Table.read(rows, format="ascii.csv", delimiter=delimiter, fill_values=_FILL)
+    delimiter, names = csv_form(head, rows[0])
+    return parse_csv(rows if names is rows[0] else [names, *rows], delimiter)
 
 
-def _read_ecsv(lines):
-    """Read ECSV; where a cell is not what the header says, as text with the header's units."""
+def parse_ecsv(lines):
+    """Parse ECSV; where a cell is not what the header says, as text with the header's units.
+
+    Parameters
+    ----------
+    lines : list of str
+        Header, names and rows.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        The table.
+    """
     try:
         return Table.read(lines, format="ascii.ecsv", fill_values=_FILL)
     except ValueError:

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from wpdc_gwcs.catalogs.units import unit_column
 from wpdc_gwcs.columns import numbers_or_nan
 from wpdc_gwcs.robust import robust_scatter
-from wpdc_gwcs.sky import annual_parallax, directions, move
+from wpdc_gwcs.sky import annual_parallax, directions, move, radial_motion
 
 __all__ = ["fill_motions", "propagate"]
 
@@ -100,28 +100,31 @@ def propagate(catalog, epoch, *, parallax=False):
     -------
     catalog : `~astropy.table.Table`
         A copy with ``ra``, ``dec``, ``pmra``, ``pmdec`` and ``ref_epoch`` at the new epoch,
-        position errors grown by the errors of the proper motion, and ``ra_pmra_corr`` and
-        ``dec_pmdec_corr`` with them.  Stars without proper motion move with their neighbors (see
+        position errors grown by the errors of the proper motion, and the correlations that these
+        change with them.  Stars without proper motion move with their neighbors (see
         `fill_motions`); where too few stars have one, and without an epoch, they stay put.
 
     Notes
     -----
     Linear motion in space on unit vectors (The Hipparcos and Tycho Catalogs, ESA SP-1200, vol. 1,
-    sect. 1.5.5), with the radial velocity taken as zero:
+    sect. 1.5.5):
 
     .. math::
-        u(t) = \langle r + \mu\,t \rangle, \qquad \mu = \mu_{\alpha*} p + \mu_\delta q
+        u(t) = \langle r (1 + \mu_r t) + \mu\,t \rangle, \qquad
+        \mu = \mu_{\alpha*} p + \mu_\delta q, \qquad \mu_r = v_r \varpi / A
 
     where r is the direction at the reference epoch, p and q the unit vectors towards East and
-    North. It is exact at the poles and across RA 0.  The variance of a position grows on each axis
-    by
+    North, and A = 4.7405 km yr / s.  The radial velocity counts as zero where it or the parallax
+    is not known.  It is exact at the poles and across RA 0.  The variance of a position grows on
+    each axis by
 
     .. math::
         \sigma^2(t) = \sigma^2 + 2 \rho\,\sigma\,\sigma_\mu t + \sigma_\mu^2 t^2
 
     with the correlation :math:`\rho` of position and motion, zero where the catalog gives none.
     An error that is not known counts as zero; columns of position errors are made where the
-    catalog has only those of the motions.  ``ra_dec_corr`` is left as it is.
+    catalog has only those of the motions.  The covariance of the two axes grows likewise, with all
+    four correlations of positions and motions that Gaia gives.
 
     Of a parallax :math:`\varpi` with the error :math:`\sigma_\varpi` is used
 
@@ -152,10 +155,17 @@ def propagate(catalog, epoch, *, parallax=False):
         pmra, pmdec = np.array(catalog["pmra"], float), np.array(catalog["pmdec"], float)
         years = epoch - np.asarray(catalog["ref_epoch"], float)
         k = np.isfinite(pmra) & np.isfinite(pmdec) & np.isfinite(years)
-        ra[k], dec[k], pmra[k], pmdec[k] = move(ra[k], dec[k], pmra[k], pmdec[k], years[k])
+        radial = _radial_motion(catalog)
+        ra[k], dec[k], pmra[k], pmdec[k] = move(
+            ra[k], dec[k], pmra[k], pmdec[k], years[k], radial=radial[k]
+        )
         moved["pmra"], moved["pmdec"] = unit_column("pmra", pmra), unit_column("pmdec", pmdec)
+        years = np.where(k, years, 0.0)
         for axis in ("ra", "dec"):
-            for name, values in _grown_errors(catalog, axis, np.where(k, years, 0.0)).items():
+            for name, values in _grown_errors(catalog, axis, years).items():
+                moved[name] = unit_column(name, values)
+        if "ra_dec_corr" in catalog.colnames:
+            for name, values in _grown_correlations(catalog, moved, years).items():
                 moved[name] = unit_column(name, values)
     if parallax and "parallax" in catalog.colnames:
         plx = _measured_parallax(catalog)
@@ -206,6 +216,39 @@ def _grown_errors(catalog, axis, years):
     with np.errstate(invalid="ignore", divide="ignore"):
         rho = np.where(product > 0, (rho * position * motion + motion * growth) / product, rho)
     return {error: later, correlation: rho}
+
+
+def _grown_correlations(catalog, moved, years):
+    """Correlations of the two axes `years` later, of a catalog whose errors have grown already."""
+
+    def covariance(a, b):
+        names = f"{a}_{b}_corr", f"{a}_error", f"{b}_error"
+        rho, *errors = (np.nan_to_num(numbers_or_nan(catalog, name)) for name in names)
+        return rho * errors[0] * errors[1]
+
+    between = covariance("pmra", "pmdec") * years
+    crossed = {(a, b): covariance(a, b) for a, b in (("ra", "pmdec"), ("dec", "pmra"))}
+    later = {pair: one + between for pair, one in crossed.items()}
+    later["ra", "dec"] = covariance("ra", "dec") + (sum(crossed.values()) + between) * years
+    found = {}
+    for (a, b), value in later.items():
+        name = f"{a}_{b}_corr"
+        product = 1.0
+        for one in (a, b):
+            product = product * numbers_or_nan(moved, f"{one}_error")
+        if name in catalog.colnames:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                found[name] = np.where(
+                    product > 0, np.clip(value / product, -1.0, 1.0), catalog[name]
+                )
+    return found
+
+
+def _radial_motion(catalog):
+    """Radial motion of every star, mas / yr; zero where it is not known."""
+    if not {"radial_velocity", "parallax"} <= set(catalog.colnames):
+        return np.zeros(len(catalog))
+    return radial_motion(numbers_or_nan(catalog, "radial_velocity"), _measured_parallax(catalog))
 
 
 def _measured_parallax(catalog):

@@ -8,10 +8,10 @@ import numpy as np
 from astropy import units as u
 from astropy.coordinates import Angle, SkyCoord
 
-from wpdc_gwcs.columns import convert, read_numbers, read_text, unit_of
+from wpdc_gwcs.columns import convert, read_numbers, read_text, spelled_names, unit_of
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
 
-__all__ = ["find_positions", "read_positions", "turn_to_icrs"]
+__all__ = ["POSITION_NAMES", "find_positions", "plain_degrees", "read_positions", "turn_to_icrs"]
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +38,7 @@ _POSITIONS = (
     ("right_ascension", "declination"),
     ("alpha", "delta"),
 )
+POSITION_NAMES = {name for pair in _POSITIONS for name in pair}
 # Columns that are radians where they have no unit: the tables of the Rubin pipelines.
 _RADIANS = ("coord_ra",)
 # Stars per square degree that no catalog has: taken for degrees, these positions are in another
@@ -156,6 +157,40 @@ def read_positions(table, pair, name):
     return {"ra": ra % 360.0, "dec": dec}, keep, rounding
 
 
+def plain_degrees(table):
+    """Positions of some rows of a larger table, where these alone tell what they are.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        Some rows: its numeric columns.
+
+    Returns
+    -------
+    (ra, dec, sure) or None
+        Degrees, and whether they cannot be radians; `None` where the columns are missing, text, of
+        another unit, or of an old system.
+    """
+    pair = find_positions(spelled_names(table.colnames))
+    if pair is None or pair[0].lower() in _RADIANS or _old_system(table.meta) is not None:
+        return None
+    found, sure = [], False
+    for name, half in zip(pair, (2 * np.pi, np.pi / 2)):
+        column = table[name]
+        unit = unit_of(column)
+        if column.dtype.kind not in "fiu":
+            return None
+        values = read_numbers(column)[0]
+        if unit is not None:
+            try:
+                values = convert(values, unit, u.deg)
+            except ValueError:
+                return None
+        sure |= unit is not None or bool(np.nanmax(np.abs(values), initial=0) > half)
+        found.append(values)
+    return *found, sure
+
+
 def _angle(column, label, name):
     """Degrees, or what the column has without a unit; and where there is no number."""
     unit = unit_of(column)
@@ -236,8 +271,7 @@ def turn_to_icrs(columns, keep, meta, name):
     CatalogError
         If there are proper motions, which would be of the old system too.
     """
-    words = [str(meta.get(k, "")) for k in ("RADESYS", "RADECSYS", "radesys", "COOSYS", "system")]
-    system = next((_OLD_SYSTEMS[w.strip().upper()] for w in words if _is_old(w)), None)
+    system = _old_system(meta)
     if system is None:
         return
     if {"pmra", "pmdec"} & set(columns):
@@ -249,5 +283,7 @@ def turn_to_icrs(columns, keep, meta, name):
     log.info("%s: positions are turned from %s to ICRS", name, system.upper())
 
 
-def _is_old(word):
-    return word.strip().upper() in _OLD_SYSTEMS
+def _old_system(meta):
+    """Frame of astropy for the old system that metadata name, or `None`."""
+    words = [str(meta.get(k, "")) for k in ("RADESYS", "RADECSYS", "radesys", "COOSYS", "system")]
+    return next((s for w in words if (s := _OLD_SYSTEMS.get(w.strip().upper()))), None)

@@ -10,15 +10,23 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import Table
 
-from wpdc_gwcs.catalogs.epochs import reference_epochs
+from wpdc_gwcs.catalogs.epochs import EPOCH_NAMES, reference_epochs
 from wpdc_gwcs.catalogs.files import (
     READ_ERRORS,
+    choose_table,
     is_fits,
     read_table_file,
     special_file,
     split_extension,
 )
-from wpdc_gwcs.catalogs.positions import find_positions, read_positions, turn_to_icrs
+from wpdc_gwcs.catalogs.pieces import part_of, pieces_of
+from wpdc_gwcs.catalogs.positions import (
+    POSITION_NAMES,
+    find_positions,
+    read_positions,
+    turn_to_icrs,
+)
+from wpdc_gwcs.catalogs.sources import catalog_source
 from wpdc_gwcs.catalogs.stars import one_of_each, read_identifiers
 from wpdc_gwcs.catalogs.units import UNITS, unit_column
 from wpdc_gwcs.columns import (
@@ -31,10 +39,9 @@ from wpdc_gwcs.columns import (
 )
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
 
-__all__ = ["read_catalog"]
+__all__ = ["identity_of", "known_names", "read_catalog"]
 
 log = logging.getLogger(__name__)
-
 
 # Output column -> aliases best first; without a unit it is that of the output.
 _OPTIONAL = {
@@ -48,7 +55,12 @@ _OPTIONAL = {
     "parallax_error": ("parallax_error", "e_plx", "e_parallax"),
     "ra_dec_corr": ("ra_dec_corr", "radecor"),
     "ra_pmra_corr": ("ra_pmra_corr", "rapmracor"),
+    "ra_pmdec_corr": ("ra_pmdec_corr", "rapmdecor"),
+    "dec_pmra_corr": ("dec_pmra_corr", "depmracor"),
     "dec_pmdec_corr": ("dec_pmdec_corr", "depmdecor"),
+    "pmra_pmdec_corr": ("pmra_pmdec_corr", "pmrapmdecor"),
+    "radial_velocity": ("radial_velocity", "dr2_radial_velocity", "rv", "rvel"),
+    "ruwe": ("ruwe",),
 }
 _MAGNITUDES = (
     "phot_g_mean_mag",
@@ -71,19 +83,24 @@ _SENTINELS = np.array([s * n for n in (999.0, 9999.0, 99999.0, 1e20, 1e30) for s
 # Magnitudes beyond stand for none (99, -99).
 _MOST_MAG = 90.0
 _MARK = "wpdc_catalog"
+_IDENTITY = "wpdc_identity"
 
 
-def read_catalog(source, *, format=None):
+def read_catalog(source, *, format=None, region=None):
     """Read a reference catalog and bring it to one form.
 
     Parameters
     ----------
-    source : path-like, `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
+    source : path-like, Table, SkyCoord, GaiaArchive or HatsCatalog
         A file in any format that astropy reads as a table (FITS, ECSV, CSV, VOTable, ...), a
         FITS_LDAC catalog, ``path[EXT]`` for one table of a FITS file, or what is already in
-        memory.  Columns may have Gaia, VizieR or SExtractor names in any case.
+        memory; ``"gaia"`` for the archive (`GaiaArchive`), ``"hats:PATH"`` for a `HatsCatalog`.
+        Columns may have Gaia, VizieR or SExtractor names in any case.
     format : str, optional
         Format name for `astropy.table.Table.read` where the file name does not tell.
+    region : Region, optional
+        What is needed.  Of an archive, a partitioned catalog or a file of more than 32 MB (FITS,
+        CSV, ECSV, Parquet) no more is kept in memory; others are given whole.
 
     Returns
     -------
@@ -95,7 +112,8 @@ def read_catalog(source, *, format=None):
     ------
     CatalogError
         If the file cannot be read, has no rows or no position columns, if a unit or most values
-        of a position are impossible.
+        of a position are impossible; if an archive does not answer, or no region is given where
+        one is needed.
 
     Warns
     -----
@@ -126,18 +144,99 @@ def read_catalog(source, *, format=None):
     10.0 -5.0             0
     10.1 -5.1             2
     """
+    source = catalog_source(source)
     if isinstance(source, SkyCoord):
         name, table = "catalog", _table_of_coordinates(source)
     elif isinstance(source, Table):
         name, table = source.meta.get(_MARK, "catalog"), source
     elif isinstance(source, str) or hasattr(source, "__fspath__"):
-        name, table = str(source), _read_table(source, format)
+        name = str(source)
+        part = _read_part(source, format, region)
+        if part is not None:
+            log.info("%s: %d of %d rows are in reach", name, len(part.rows), part.n_rows)
+            if part.n_wrong:
+                warnings.warn(
+                    f"{name}: {part.n_wrong} of {part.n_rows} rows are left out: their positions "
+                    "are off the sky",
+                    WPDCWarning,
+                )
+            return _standardize_part(part.table, name, part.rows, _file_identity(source))
+        table = _read_table(source, format)
         table.meta.pop(_MARK, None)
+    elif hasattr(source, "stars_of"):
+        name = str(source)
+        if region is None:
+            raise CatalogError(f"{name}: needs a region of the sky, got none: it is too large")
+        table = source.stars_of(region)
+        return _standardize_part(table, name, np.arange(len(table)), source.identity)
     else:
         raise TypeError(
             f"catalog must be a path, a Table or a SkyCoord, got {type(source).__name__}"
         )
     return _standardize(table, name)
+
+
+def known_names():
+    """Names of columns that `read_catalog` looks at.
+
+    Returns
+    -------
+    set of str
+        In lower case.
+    """
+    aliases = [*_OPTIONAL.values(), _MAGNITUDES, _COLORS, _BLUE, _RED, EPOCH_NAMES]
+    ellipse = {f"err{a}{tag}_world" for a in ("a", "b", "theta") for tag in ("psf", "win", "")}
+    return {n for names in aliases for n in names} | POSITION_NAMES | ellipse | {"source_id"}
+
+
+def identity_of(catalog):
+    """Tell what a part of a catalog is a part of.
+
+    Parameters
+    ----------
+    catalog : `~astropy.table.Table`
+        As returned by `read_catalog`.
+
+    Returns
+    -------
+    str or None
+        The same for all parts; `None` of a catalog that was read whole.
+    """
+    return catalog.meta.get(_IDENTITY)
+
+
+def _standardize_part(table, name, rows, identity):
+    """Build the checked table of a part, which may have no stars at all."""
+    if len(table) == 0:
+        part = Table({c: unit_column(c, np.zeros(0)) for c in ("ra", "dec")})
+        part["catalog_index"] = np.zeros(0, int)
+        part.meta[_MARK] = name
+    else:
+        part = _standardize(table, name, rows)
+    part.meta[_IDENTITY] = identity
+    return part
+
+
+def _read_part(path, format, region):
+    """Rows of a region, of a file that is too large to be read whole; `None` of others."""
+    path, extension = split_extension(path)
+    if region is None or format is not None or not path.is_file():
+        return None
+    try:
+        # As for whole files: what the readers warn of is checked afterwards.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            pieces = pieces_of(path.absolute(), extension, known_names())
+            return None if pieces is None else part_of(pieces, region)
+    except READ_ERRORS as problem:
+        # Whoever reads it whole tells what is wrong with it.
+        log.info("%s: cannot be read in pieces: %s", path, problem)
+        return None
+
+
+def _file_identity(source):
+    stat = split_extension(source)[0].stat()
+    return f"{source} {stat.st_size} {stat.st_mtime_ns}"
 
 
 def _read_table(path, format):
@@ -154,7 +253,9 @@ def _read_table(path, format):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if format in (None, "fits") and is_fits(path):
-                return _read_fits_table(path, extension)
+                with fits.open(path, memmap=False) as hdus:
+                    hdu = choose_table(hdus, path, extension)
+                    return Table.read(hdu, format="fits", mask_invalid=False)
             if extension is not None:
                 raise CatalogError(f"{path}[{extension}]: only FITS files have extensions")
             if format is None and re.search(r"\.(fits?|fts|fz)(\.gz)?$", path.name.lower()):
@@ -169,21 +270,6 @@ def _read_table(path, format):
         ) from error
 
 
-def _read_fits_table(path, extension):
-    with fits.open(path, memmap=False) as hdus:
-        if extension is not None:
-            tables = [hdus[extension]]
-            if not isinstance(tables[0], fits.BinTableHDU | fits.TableHDU):
-                raise CatalogError(f"{path}[{extension}]: must be a table extension")
-        else:
-            tables = [h for h in hdus if isinstance(h, fits.BinTableHDU | fits.TableHDU)]
-            if not tables:
-                raise CatalogError(f"{path}: must have a table extension, has none")
-            # LDAC files have a header table first, others whatever their writer liked.
-            tables.sort(key=lambda h: find_positions(spelled_names(h.columns.names)) is None)
-        return Table.read(tables[0], format="fits", mask_invalid=False)
-
-
 def _table_of_coordinates(coordinates):
     icrs = coordinates.icrs.reshape(-1) if coordinates.isscalar else coordinates.icrs.ravel()
     table = Table({"ra": icrs.ra.deg, "dec": icrs.dec.deg})
@@ -195,8 +281,8 @@ def _table_of_coordinates(coordinates):
     return table
 
 
-def _standardize(table, name):
-    """Build the checked table; `name` is what messages call the input."""
+def _standardize(table, name, rows=None):
+    """Build the checked table; `name` is what messages call the input, `rows` where they were."""
     if len(table) == 0:
         raise CatalogError(f"{name}: catalog must have rows, has 0")
     spelled = spelled_names(table.colnames)
@@ -232,7 +318,7 @@ def _standardize(table, name):
     result = Table({c: unit_column(c, np.ascontiguousarray(v[keep])) for c, v in columns.items()})
     if identifiers is not None:
         result["source_id"] = identifiers[keep]
-    index = np.arange(len(table))
+    index = np.arange(len(table)) if rows is None else rows
     if isinstance(table.meta.get(_MARK), str) and "catalog_index" in table.colnames:
         # What read_catalog returned, possibly cut since: its rows keep pointing to the first input.
         index = np.asarray(table["catalog_index"])
@@ -241,6 +327,8 @@ def _standardize(table, name):
         # Else a second reading would take what has been filled for measured.
         result["pm_from_neighbors"] = np.asarray(table[spelled["pm_from_neighbors"]])[keep]
     result.meta[_MARK] = name
+    if _IDENTITY in table.meta and _MARK in table.meta:
+        result.meta[_IDENTITY] = table.meta[_IDENTITY]
     return result
 
 

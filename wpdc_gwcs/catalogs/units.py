@@ -19,6 +19,7 @@ UNITS = {
     "pmra_error": u.mas / u.yr,
     "pmdec_error": u.mas / u.yr,
     "parallax_error": u.mas,
+    "radial_velocity": u.km / u.s,
 }
 
 

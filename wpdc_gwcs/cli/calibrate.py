@@ -10,6 +10,7 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import (
+    Cache,
     Config,
     Epoch,
     Gain,
@@ -24,6 +25,7 @@ from wpdc_gwcs.cli.options import (
     Preset,
     Quiet,
     Saturation,
+    TapUrl,
     Threshold,
     Verbose,
     WeightMap,
@@ -43,7 +45,8 @@ Catalog = Annotated[
     typer.Option(
         "--catalog",
         metavar="CAT",
-        help="Reference catalog: FITS_LDAC, or any table astropy reads (Gaia column names).",
+        help="Reference catalog: FITS_LDAC, or any table astropy reads (Gaia column names); "
+        "'gaia' asks the archive, 'hats:PATH' reads a partitioned catalog.",
     ),
 ]
 WcsFile = Annotated[
@@ -179,6 +182,8 @@ def calibrate_command(
     min_snr: MinSNR = 10.0,
     max_roundness: MaxRoundness = 0.3,
     max_mag: MaxMag = None,
+    tap_url: TapUrl = None,
+    cache: Cache = None,
     gain: Gain = None,
     saturation: Saturation = None,
     mask: Mask = None,
@@ -243,6 +248,7 @@ def calibrate_command(
     from wpdc_gwcs.calibration import Settings, calibrate
     from wpdc_gwcs.calibration.cluster import cluster_executor
     from wpdc_gwcs.calibration.results import ERRORS
+    from wpdc_gwcs.catalogs import catalog_source
     from wpdc_gwcs.io import read_files
 
     if report:
@@ -298,7 +304,7 @@ def calibrate_command(
     with cluster as pool, progress_bar(quiet=quiet) as progress:
         run = calibrate(
             loaded,
-            catalog,
+            catalog_source(catalog, url=tap_url, cache=cache, max_mag=max_mag),
             solution=stored,
             update=update,
             settings=settings,

@@ -13,6 +13,7 @@ from wpdc_gwcs.cli.app import set_verbosity
 from wpdc_gwcs.exceptions import InputError
 
 __all__ = [
+    "Cache",
     "Config",
     "Epoch",
     "Gain",
@@ -27,6 +28,7 @@ __all__ = [
     "Preset",
     "Quiet",
     "Saturation",
+    "TapUrl",
     "Threshold",
     "Verbose",
     "by_hand",
@@ -204,6 +206,22 @@ WeightMap = Annotated[
     ),
 ]
 
+TapUrl = Annotated[
+    str | None,
+    typer.Option(
+        metavar="URL",
+        envvar="WPDC_GWCS_TAP_URL",
+        help="Service that is asked for --catalog gaia; default: the Gaia archive at ESA.",
+    ),
+]
+Cache = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        envvar="WPDC_GWCS_CACHE",
+        help="Folder of what came from there; default: that of astropy's caches.",
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that are already there.")
 ]

@@ -9,6 +9,7 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.calibrate import Catalog, WcsFile
 from wpdc_gwcs.cli.options import (
+    Cache,
     Epoch,
     Gain,
     Mask,
@@ -21,6 +22,7 @@ from wpdc_gwcs.cli.options import (
     PixelScale,
     Quiet,
     Saturation,
+    TapUrl,
     Threshold,
     Verbose,
     WeightMap,
@@ -115,6 +117,8 @@ def match_command(
     min_snr: MinSNR = 10.0,
     max_roundness: MaxRoundness = 0.3,
     max_mag: MaxMag = None,
+    tap_url: TapUrl = None,
+    cache: Cache = None,
     gain: Gain = None,
     saturation: Saturation = None,
     mask: Mask = None,
@@ -134,7 +138,7 @@ def match_command(
     import numpy as np
 
     from wpdc_gwcs.calibration import Settings, match_frame
-    from wpdc_gwcs.catalogs import read_catalog
+    from wpdc_gwcs.catalogs import catalog_source
     from wpdc_gwcs.io import write_table
     from wpdc_gwcs.matching import pair_table
 
@@ -153,9 +157,9 @@ def match_command(
     given = by_hand(epoch, pixel_scale, origin)
     given |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
     one = one_frame(frame, wcs=wcs, **given)
-    reference = read_catalog(catalog)
-    matched = match_frame(one, reference, settings)
-    if one.epoch is None and "pmra" in reference.colnames:
+    source = catalog_source(catalog, url=tap_url, cache=cache, max_mag=max_mag)
+    matched = match_frame(one, source, settings)
+    if one.epoch is None and "pmra" in matched.reference.colnames:
         log.warning("%s has no epoch: the stars' motions were not applied (--epoch)", one.source)
     i, j = matched.pairs
     x, y = (np.asarray(matched.sources[name], float)[i] for name in ("x", "y"))

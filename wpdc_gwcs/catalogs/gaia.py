@@ -1,0 +1,262 @@
+"""Gaia's archive: the stars of a region, asked for cell by cell and kept on disk.
+
+::
+
+    region --> HEALPix cells --(kept already?)--> one query each --> file in the cache --> one table
+"""
+
+import contextlib
+import hashlib
+import logging
+import os
+import re
+import tempfile
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table, vstack
+
+from wpdc_gwcs.catalogs.cells import cells_in, cells_of, circles_of
+from wpdc_gwcs.catalogs.extras import require
+from wpdc_gwcs.catalogs.files import READ_ERRORS
+from wpdc_gwcs.exceptions import CatalogError
+
+__all__ = ["GaiaArchive"]
+
+log = logging.getLogger(__name__)
+
+_ESA = "https://gea.esac.esa.int/tap-server/tap"
+_TABLE = "gaiadr3.gaia_source"
+# What a calibration looks at: 22 of 152 columns.
+_COLUMNS = (
+    *("source_id", "ref_epoch", "ra", "dec", "pmra", "pmdec", "parallax", "radial_velocity"),
+    *("ra_error", "dec_error", "pmra_error", "pmdec_error", "parallax_error", "ruwe"),
+    *("ra_dec_corr", "ra_pmra_corr", "ra_pmdec_corr"),
+    *("dec_pmra_corr", "dec_pmdec_corr", "pmra_pmdec_corr"),
+    *("phot_g_mean_mag", "bp_rp"),
+)
+# Fainter ones have motions uncertain by 1 mas / yr and more: of no use some years later.
+_FAINTEST = 20.5
+# Cells of 0.8 square degrees: one to four for a frame, and a million stars where the sky is full.
+_ORDER = 6
+# Services that do not say how many rows they give may stop at 2000.
+_MOST_ROWS = 5_000_000
+# s before each try
+_WAITS = (0.0, 2.0, 10.0)
+# s to connect, and until an answer comes; a query may stand in a queue
+_TIMEOUTS = (15.0, 300.0)
+# Answers of services that have no jobs, but give results at once.
+_NO_JOBS = (404, 405, 501)
+
+
+@dataclass(frozen=True)
+class GaiaArchive:
+    """Gaia DR3 in an archive that answers queries (TAP); what came once is kept on disk.
+
+    Parameters
+    ----------
+    url : str, optional
+        Address of the service; default: ``WPDC_GWCS_TAP_URL`` of the environment, else that of the
+        Gaia archive at ESA.
+    cache : path-like, optional
+        Folder of what came; default: ``WPDC_GWCS_CACHE`` of the environment, else the cache folder
+        that astropy would use for this package.
+    max_mag : float, optional
+        G magnitude of the faintest stars asked for.
+    table : str, optional
+        Table of the service, with the columns of ``gaia_source``.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.catalogs import GaiaArchive
+    >>> print(GaiaArchive(url="https://gaia.aip.de/tap", max_mag=19.0))
+    gaiadr3.gaia_source at https://gaia.aip.de/tap, G <= 19
+    """
+
+    url: str | None = None
+    cache: str | Path | None = None
+    max_mag: float = _FAINTEST
+    table: str = _TABLE
+
+    def __post_init__(self):
+        url = self.url or os.environ.get("WPDC_GWCS_TAP_URL") or _ESA
+        if not re.match(r"https?://[^/\s]+", url):
+            raise CatalogError(f"address of a TAP service must begin with http(s)://, got {url!r}")
+        object.__setattr__(self, "url", url.rstrip("/"))
+        if not re.fullmatch(r"[\w.\"]+", self.table):
+            raise CatalogError(f"table of a TAP service must be a name, got {self.table!r}")
+        if not np.isfinite(self.max_mag):
+            raise CatalogError(f"max_mag must be a finite magnitude, got {self.max_mag}")
+
+    def __str__(self):
+        return f"{self.table} at {self.url}, G <= {self.max_mag:g}"
+
+    @property
+    def identity(self):
+        """What it is that is asked, the same for all regions."""
+        return str(self)
+
+    def stars_of(self, region):
+        """Get the stars of a region.
+
+        Parameters
+        ----------
+        region : Region
+            Part of the sky.
+
+        Returns
+        -------
+        `~astropy.table.Table`
+            Columns as in the archive; stars of no other part of the sky.
+
+        Raises
+        ------
+        CatalogError
+            If the archive does not answer, refuses, or would not give all; the message tells what
+            to do.
+        """
+        require("--catalog gaia", "gaia", "pyvo", "astropy_healpix")
+        cells = cells_in(region, _ORDER)
+        folder = self._folder()
+        found = {cell: self._kept(folder, cell) for cell in cells.tolist()}
+        missing = [cell for cell, table in found.items() if table is None]
+        if missing:
+            log.info(
+                "asking %s for %d of %d cells of the sky (%s has the others)",
+                *(self, len(missing), len(cells), folder),
+            )
+        for number, cell in enumerate(missing, 1):
+            began = time.perf_counter()
+            found[cell] = self._ask(cell)
+            _keep(found[cell], folder / f"Npix={cell}-G{self.max_mag:g}.fits")
+            log.info(
+                "cell %d of %d: %d stars in %.1f s",
+                *(number, len(missing), len(found[cell]), time.perf_counter() - began),
+            )
+        stars = vstack(list(found.values()), metadata_conflicts="silent")
+        ra, dec = (np.asarray(stars[name], float) for name in ("ra", "dec"))
+        return stars[region.contains(ra, dec)]
+
+    def _folder(self):
+        root = self.cache or os.environ.get("WPDC_GWCS_CACHE")
+        if not root:
+            from astropy.config import get_cache_dir
+
+            try:
+                root = get_cache_dir("wpdc_gwcs")
+            except OSError as problem:
+                root = tempfile.gettempdir()
+                log.warning("no cache folder (%s): %s is used", problem, root)
+        # Services differ in what they have, and a stand-in of theirs is none of them.
+        service = hashlib.sha256(f"{self.url} {self.table}".encode()).hexdigest()[:8]
+        return Path(root) / "gaia" / f"{self.table.replace(chr(34), '')}-{service}"
+
+    def _kept(self, folder, cell):
+        """Table of a cell from disk, or None: one of fainter stars has the brighter ones."""
+        kept = {}
+        for path in folder.glob(f"Npix={cell}-G*.fits"):
+            with contextlib.suppress(ValueError):
+                kept[float(path.stem.partition("-G")[2])] = path
+        for limit in sorted(limit for limit in kept if limit >= self.max_mag):
+            try:
+                table = Table.read(kept[limit], format="fits", mask_invalid=False)
+            except READ_ERRORS as problem:
+                log.info("%s: cannot be read, and is asked for again: %s", kept[limit], problem)
+                continue
+            if set(_COLUMNS) <= set(table.colnames):
+                return table[np.asarray(table["phot_g_mean_mag"]) <= self.max_mag]
+        return None
+
+    def _ask(self, cell):
+        import pyvo
+        import requests
+
+        (ra,), (dec,), (radius,) = circles_of(_ORDER, [cell])
+        query = (
+            f"SELECT {', '.join(_COLUMNS)} FROM {self.table} WHERE 1 = CONTAINS("
+            f"POINT('ICRS', ra, dec), CIRCLE('ICRS', {ra:.8f}, {dec:.8f}, {radius:.8f})) "
+            f"AND phot_g_mean_mag <= {self.max_mag:g}"
+        )
+        problem = None
+        for wait in _WAITS:
+            if problem is not None:
+                log.info("%s: %s: another try in %g s", self.url, problem, wait)
+                time.sleep(wait)
+            try:
+                table = _answer(self.url, query)
+                break
+            except pyvo.dal.DALQueryError as refusal:
+                raise CatalogError(f"{self.url} refuses the query: {_line(refusal)}") from refusal
+            except pyvo.dal.DALOverflowWarning as overflow:
+                raise CatalogError(
+                    f"{self.url} does not give all stars of a cell of 0.8 square degrees: ask for "
+                    f"fewer (--max-mag, now {self.max_mag:g}), or another service (--tap-url)"
+                ) from overflow
+            except (pyvo.dal.DALAccessError, requests.RequestException, *READ_ERRORS) as error:
+                problem = _line(error)
+        else:
+            raise CatalogError(
+                f"{self.url} does not answer, in {len(_WAITS)} tries: {problem}; name another "
+                "service (--tap-url), or make a file where there is a network ('wpdc catalog "
+                "prepare gaia') and give it as --catalog"
+            )
+        lacking = set(_COLUMNS) - set(table.colnames)
+        if lacking:
+            raise CatalogError(f"{self.url} does not give the columns {', '.join(sorted(lacking))}")
+        table = Table(table)[list(_COLUMNS)]
+        ra, dec = (np.asarray(table[name], float) for name in ("ra", "dec"))
+        return table[cells_of(_ORDER, ra, dec) == cell]
+
+
+def _answer(url, query):
+    import pyvo
+
+    with warnings.catch_warnings():
+        # Of VOTables that are not quite in the standard; that rows are missing is an error.
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("error", pyvo.dal.DALOverflowWarning)
+        with _session() as session:
+            service = pyvo.dal.TAPService(url, session=session)
+            try:
+                result = service.run_async(query, maxrec=_MOST_ROWS)
+            except pyvo.dal.DALServiceError as error:
+                if getattr(error, "code", None) not in _NO_JOBS:
+                    raise
+                result = service.run_sync(query, maxrec=_MOST_ROWS)
+        return result.to_table()
+
+
+def _session():
+    import requests
+
+    class Session(requests.Session):
+        def request(self, *args, **kwargs):
+            kwargs["timeout"] = _TIMEOUTS
+            return super().request(*args, **kwargs)
+
+    return Session()
+
+
+def _keep(table, path):
+    """Write a cell into the cache, whole or not at all; a cache that cannot be used is no error."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(".tmp", dir=path.parent)
+        os.close(handle)
+        try:
+            plain = Table(table, meta={})
+            plain.write(temporary, format="fits", overwrite=True)
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+    except OSError as problem:
+        log.warning("what came from the archive cannot be kept: %s", problem)
+
+
+def _line(error):
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 200 else text[:197] + "..."
