@@ -73,6 +73,17 @@ def test_calibrate_writes_what_it_promises(results, simulation):
         )
 
 
+def test_calibrate_as_the_paper_does(inputs, simulation, tmp_path):
+    frames, reference = inputs
+    arguments = ["calibrate", *frames, "--catalog", reference, "--output", str(tmp_path)]
+    assert run([*arguments, "--method", "paper", "--weight", "w1", "-q"]) == 0
+    for exposure in simulation.exposures:
+        found = read(tmp_path / f"{exposure.name}.wcs.asdf")
+        assert found.settings["method"] == "paper"
+        _, _, dx, dy = exposure.wcs_error(found.wcs)
+        assert np.sqrt(np.mean(dx**2 + dy**2)) < 0.5
+
+
 def test_existing_files_are_kept(inputs, results, capsys):
     frames, reference = inputs
     before = {p.name: p.read_bytes() for p in results.iterdir()}
@@ -161,6 +172,12 @@ def make_bad_files(folder, reference):
         (["{frame}", "--output", "/dev/null"], "/dev/null: the output folder must be writable"),
         (["{frame}", "--jobs", "0"], "--jobs must be at least 1, got 0"),
         (["{frame}", "--update"], "--update needs the stored solution"),
+        (["{frame}", "--method", "scamp"], "method must be one of wpdc, paper, got 'scamp'"),
+        (["{frame}", "--method", "paper", "--refine", "field"], "refine must be auto or pv with"),
+        (
+            ["{frame}", "--method", "paper", "--update", "--solution", "a.asdf"],
+            "--update needs --method wpdc",
+        ),
         (["{frame}", "--no-such-option"], "No such option"),
         (["{frame}", "{frame}"], "would both write sim-01.wcs.asdf"),
         (["{frame}", "--config", "{dir}/missing.toml"], "missing.toml: no such configuration"),

@@ -4,12 +4,14 @@ import logging
 import time
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 
 import numpy as np
 from astropy.table import Table
 
 from wpdc_gwcs.calibration.checks import check_solution, shortcomings
+from wpdc_gwcs.calibration.literal import solve_frames_literally
 from wpdc_gwcs.calibration.positions import with_sky_positions
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import (
@@ -114,6 +116,12 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
     if update:
         group = _of_valid_epoch(group, solution, failures)
     began = time.perf_counter()
+    if settings.method == "paper" and group:
+        exposure_of = partial(_exposure, holdout=holdout)
+        result, pairs = solve_frames_literally(
+            group, settings, exposure_of=exposure_of, solution=solution
+        )
+        return _delivered(group, pairs, result, settings, holdout, solution, failures, began)
     shapes = {frame.detector: tuple(frame.image_shape) for frame in group}
     crpix = {}
     for frame in group:
@@ -176,6 +184,13 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
                 attitudes[frame.name] = LinearWCS(
                     crpix=crpix[frame.detector], cd=fit.cd, crval=fit.crval
                 )
+    return _delivered(
+        group, pairs, result, settings, holdout, solution, failures, began, update=update
+    )
+
+
+def _delivered(group, pairs, result, settings, holdout, solution, failures, began, *, update=False):
+    """Make the results of all frames that pass their checks, and of their detectors."""
     seconds = (time.perf_counter() - began) / len(group)
     solutions = {}
     for name, one in result.solutions.items():
@@ -301,9 +316,13 @@ def _with_scatter(solution, scatters):
 def _as_calibration(frame, fit, result, **more):
     """Calibration of a frame from the result of the solution."""
     solution = result.solutions[frame.detector]
+    if fit.pv is not None:
+        solution = replace(solution, pv=fit.pv)
+    if fit.crpix is not None:
+        solution = replace(solution, crpix=fit.crpix, cd=fit.cd)
     return Calibration(
         frame=frame.name,
-        solution=solution if fit.pv is None else replace(solution, pv=fit.pv),
+        solution=solution,
         crval=np.asarray(fit.crval),
         cd=np.asarray(fit.cd),
         field=fit.field,
@@ -472,7 +491,8 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
         settings=asdict(settings),
         provenance=_provenance([frame]),
     )  # fmt: skip
-    known = stored is not None or len(result.solutions) > 1
+    together = len(result.solutions) > 1 and settings.method != "paper"
+    known = stored is not None or together
     check_solution(frame, calibration, stored=stored, known=known)
     reasons = shortcomings(frame, calibration, held=held, known=known, stored=stored)
     status = "degraded" if reasons else "solved"

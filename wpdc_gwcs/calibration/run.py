@@ -138,7 +138,7 @@ def calibrate(
     TypeError
         If what is given is no frame, for example the path of one.
     ValueError
-        If there is no frame.
+        If there is no frame, or ``update`` is asked for with ``method="paper"``.
     InputError
         If the catalog cannot be used, a file cannot be written or may not be replaced, or a run
         of other choices is to be resumed.
@@ -160,6 +160,10 @@ def calibrate(
         raise ValueError(f"jobs must be at least 1, got {jobs}")
     if resume and output is None:
         raise ValueError("resume needs the output folder of the run that is resumed")
+    if update and settings.method == "paper":
+        raise ValueError(
+            "update needs method='wpdc': the paper's table is made anew, from frames of its time"
+        )
     progress = progress or (lambda stage, done, total: None)
     solution = getattr(solution, "solutions", solution)
     frames = _named_apart(tie_exposures(frames)) if solution is None else tie_exposures(frames)

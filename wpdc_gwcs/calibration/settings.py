@@ -12,6 +12,7 @@ from wpdc_gwcs.selection import MAX_ROUNDNESS, MIN_SNR
 __all__ = ["Settings"]
 
 _CHOICES = {
+    "method": ("wpdc", "paper"),
     "centroids": ("psf", "windowed", "given"),
     "reference_point": ("header", "center", "nearest-source"),
     "refine": ("auto", "attitude", "field", "pv"),
@@ -27,7 +28,8 @@ class Settings:
     ----------
     weight : str, optional
         Radial weight of the polynomial, the table has the rest: ``exp-sqrt`` (the paper's),
-        ``gaussian``, ``inverse``, ``inverse-square`` or ``uniform``.
+        ``gaussian``, ``inverse``, ``inverse-square`` (``w1`` to ``w4`` in the paper) or
+        ``uniform``.
     r0 : float, optional
         Radius in px within which the polynomial follows the distortion; `None` is 0.87 times half
         the shorter side.
@@ -67,6 +69,10 @@ class Settings:
         Search a wide range of pointing, orientation, parity and scale for the match.
     seed : int, optional
         Seed of the random choice of held-out stars.
+    method : {'wpdc', 'paper'}, optional
+        One solution of all exposures with learnt priors (``wpdc``), or the literal WPDC-2P
+        (``paper``), to be compared with: a polynomial of each exposure about its header's tangent
+        point, raw residuals in a bilinear table.
     """
 
     weight: str = "exp-sqrt"
@@ -86,14 +92,21 @@ class Settings:
     holdout: float = 0.0
     blind: bool = False
     seed: int = 0
+    method: str = "wpdc"
 
     def __post_init__(self):
-        RadialWeight(self.weight, r0=1000.0 if self.r0 is None else self.r0)
+        weight = RadialWeight(self.weight, r0=1000.0 if self.r0 is None else self.r0)
+        object.__setattr__(self, "weight", weight.name)
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ValueError(
                     f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
                 )
+        if self.method == "paper" and self.refine not in ("auto", "pv"):
+            raise ValueError(
+                "refine must be auto or pv with method='paper', where every exposure has a "
+                f"polynomial of its own, got {self.refine!r}"
+            )
         if self.degree != "auto" and self.degree not in range(1, 8):
             raise ValueError(f"degree must be 'auto' or 1 to 7, got {self.degree!r}")
         if not 4 <= self.n_grid <= 1000:

@@ -114,6 +114,14 @@ def calibrate_command(
             "field where its evidence is there (auto) or always (field), or a polynomial (pv).",
         ),
     ] = "auto",
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="{wpdc,paper}",
+            help="One solution of all exposures (wpdc), or the literal WPDC-2P to compare with "
+            "(paper): a polynomial of each exposure, raw residuals in a bilinear table.",
+        ),
+    ] = "wpdc",
     degree: Annotated[
         str,
         typer.Option(
@@ -134,7 +142,7 @@ def calibrate_command(
         typer.Option(
             metavar="NAME",
             help="Radial weight of the polynomial, the table has the rest: exp-sqrt, gaussian, "
-            "inverse, inverse-square or uniform.",
+            "inverse, inverse-square (the paper's w1 to w4) or uniform.",
         ),
     ] = "exp-sqrt",
     r0: Annotated[
@@ -233,6 +241,10 @@ def calibrate_command(
         require_plotting("--report")
     if update and not solution:
         raise InputError("--update needs the stored solution: --solution FILE")
+    if update and method == "paper":
+        raise InputError(
+            "--update needs --method wpdc: the paper's table is made anew, from frames of its time"
+        )
     if no_camera and exposure_key is not None:
         raise InputError("--exposure-key ties detectors together, --no-camera keeps them apart")
     if detector is not None and not (detector.strip() and detector.isprintable()):
@@ -248,6 +260,7 @@ def calibrate_command(
             n_grid=n_grid,
             lut=lut,
             refine=refine,
+            method=method,
             degree=int(degree) if degree.isdigit() else degree,
             centroids=centroids,
             reference_point=reference_point,

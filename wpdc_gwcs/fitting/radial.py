@@ -8,6 +8,8 @@ import numpy as np
 __all__ = ["RadialWeight"]
 
 _WEIGHTS = ("exp-sqrt", "gaussian", "inverse", "inverse-square", "uniform")
+# As the paper numbers them.
+_NUMBERED = {f"w{k}": name for k, name in enumerate(_WEIGHTS[:4], 1)}
 
 
 @dataclass(frozen=True)
@@ -17,7 +19,8 @@ class RadialWeight:
     Parameters
     ----------
     name : {'exp-sqrt', 'gaussian', 'inverse', 'inverse-square', 'uniform'}, optional
-        Weighting function outside ``r0``; inside, every weight is 1.
+        Weighting function outside ``r0``; inside, every weight is 1.  The paper's ``w1`` to ``w4``
+        are the first four.
     r0 : float, optional
         Radius in px within which all stars weigh the same.
 
@@ -59,8 +62,11 @@ class RadialWeight:
     r0: float = 4000.0
 
     def __post_init__(self):
-        if self.name not in _WEIGHTS:
-            raise ValueError(f"weight must be one of {', '.join(_WEIGHTS)}, got {self.name!r}")
+        if self.name not in _WEIGHTS and self.name not in _NUMBERED:
+            raise ValueError(
+                f"weight must be one of {', '.join(_WEIGHTS)} or w1 to w4, got {self.name!r}"
+            )
+        object.__setattr__(self, "name", _NUMBERED.get(self.name, self.name))
         if not (np.isfinite(self.r0) and self.r0 > 0):
             raise ValueError(f"r0 must be a positive number of px, got {self.r0}")
 

@@ -52,6 +52,7 @@ A blind search does all this for the eight ways to read the axes of the frame, w
 pointing and scale.
 """
 
+from wpdc_gwcs.matching._again import pair_again
 from wpdc_gwcs.matching._core import match_planes
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._evidence import AreaEvidence
@@ -70,6 +71,7 @@ __all__ = [
     "match_nearby",
     "match_planes",
     "match_sources",
+    "pair_again",
     "pair_nearest",
     "pair_table",
     "select_sources",

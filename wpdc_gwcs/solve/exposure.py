@@ -81,6 +81,9 @@ class ExposureFit:
         The exposure's own displacement, to be subtracted with the table of the instrument.
     pv : PVPolynomial or None
         The exposure's own polynomial with ``refine="pv"``.
+    crpix : (2,) ndarray or None
+        Reference point of the exposure's own polynomial where that is not the detector's, px, zero
+        based; the polynomial is then in the matrix ``cd``.
     color_shift : (2, 3) ndarray or None
         Displacement of stars per magnitude of color in undistorted px: constant and linear part.
     reason : str or None
@@ -100,6 +103,7 @@ class ExposureFit:
     sigma: np.ndarray | None = None
     field: "LookupTable | None" = None
     pv: "PVPolynomial | None" = None
+    crpix: np.ndarray | None = None
     color_shift: np.ndarray | None = None
     reason: str | None = None
     statistics: dict = dataclasses.field(default_factory=dict)

@@ -1,0 +1,23 @@
+"""The literal WPDC-2P, as the paper has it: ``method="paper"``.
+
+::
+
+    pairs --each exposure: weighted cubic about the header's tangent point,
+            ten steps of 50 %, matched again after each--> PV polynomials, residuals
+    residuals of all exposures of a detector --raw RBF--> 50 x 50 nodes from 0 to n, bilinear
+
+It is here to be compared with: `wpdc_gwcs.solve` is what the package does by default.
+"""
+
+from wpdc_gwcs.paper.polynomial import DAMPING, MAX_STEPS, ExposurePolynomial, fit_exposure
+from wpdc_gwcs.paper.solution import solve_literally
+from wpdc_gwcs.paper.table import build_raw_table
+
+__all__ = [
+    "DAMPING",
+    "MAX_STEPS",
+    "ExposurePolynomial",
+    "build_raw_table",
+    "fit_exposure",
+    "solve_literally",
+]
