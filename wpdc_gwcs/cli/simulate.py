@@ -7,7 +7,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
-from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose
+from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, read_numbers
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.exceptions import InputError
 
@@ -165,7 +165,7 @@ def simulate_command(
         "waves": waves,
         "pixel_scale": pixel_scale,
         "fwhm": fwhm,
-        "magnitudes": None if magnitudes is None else _numbers("--magnitudes", magnitudes, 2),
+        "magnitudes": None if magnitudes is None else read_numbers("--magnitudes", magnitudes, 2),
         "image_shape": None if size is None else _shape(size),
     }
     usual = {
@@ -197,7 +197,7 @@ def simulate_command(
             if cluster
             else None,
             galaxies=galaxies,
-            colors=None if colors is None else _numbers("--colors", colors, 2),
+            colors=None if colors is None else read_numbers("--colors", colors, 2),
             epoch=None if epoch is None else _epochs(epoch, exposures),
             lost=lost,
             **given,
@@ -265,18 +265,6 @@ def _commands(files, folder):
     yield f"wpdc calibrate {' '.join(names)} --catalog {catalog} --output results"
 
 
-def _numbers(option, text, n=None, separator=","):
-    try:
-        numbers = tuple(float(part) for part in text.split(separator))
-    except ValueError:
-        numbers = ()
-    if not numbers or (n is not None and len(numbers) != n) or not np.isfinite(numbers).all():
-        what = {None: "numbers", 1: "a number"}.get(n, f"{n} numbers")
-        between = "" if n == 1 else f" with {separator!r} between them"
-        raise InputError(f"{option} must be {what}{between}, got {text!r}")
-    return numbers
-
-
 def _shape(text):
     try:
         sides = [int(part) for part in text.lower().split("x")]
@@ -289,8 +277,8 @@ def _shape(text):
 
 def _densities(text, n_fields):
     if ":" not in text:
-        return _numbers("--density", text)
-    low, high = _numbers("--density", text, 2, ":")
+        return read_numbers("--density", text)
+    low, high = read_numbers("--density", text, 2, ":")
     if not 0 < low <= high:
         raise InputError(f"--density LOW:HIGH must be positive and rise, got {text!r}")
     return np.geomspace(low, high, n_fields)
@@ -298,8 +286,8 @@ def _densities(text, n_fields):
 
 def _epochs(text, n_exposures):
     if ":" not in text:
-        return _numbers("--epoch", text, 1)[0]
-    return np.linspace(*_numbers("--epoch", text, 2, ":"), max(n_exposures, 1))
+        return read_numbers("--epoch", text, 1)[0]
+    return np.linspace(*read_numbers("--epoch", text, 2, ":"), max(n_exposures, 1))
 
 
 def _centers(texts, fields, seed):

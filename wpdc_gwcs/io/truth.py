@@ -57,14 +57,7 @@ def true_wcs(truth, *, first_step=None):
         From ``detector`` over ``undistorted`` to ``icrs``, exact to rounding (1e-8 px).
     """
     linear = truth.linear_wcs.wcs
-    stock = to_stock_wcs(
-        build_wcs(
-            crpix=linear.crpix - 1,
-            cd=linear.cd,
-            crval=linear.crval,
-            image_shape=truth.image_shape,
-        )
-    )
+    stock = to_stock_wcs(build_wcs(crpix=linear.crpix - 1, cd=linear.cd, crval=linear.crval))
     detector, undistorted, sky = stock.pipeline
     first_step = _stock_distortion(truth.distortion) if first_step is None else first_step
     wcs = GWCS(
@@ -137,13 +130,15 @@ def write_truths(truths, path, *, camera, catalog, files, overwrite=False):
     """
     from wpdc_gwcs import __version__
 
-    first_steps = {t.detector: _stock_distortion(t.distortion) for t in truths}
+    # One model for all frames of a detector, which the file then has once.
+    distortions = {t.detector: t.distortion for t in truths}
+    first_steps = {name: _stock_distortion(one) for name, one in distortions.items()}
     tree = {
         "format_version": _FORMAT_VERSION,
         "software": {"name": "wpdc_gwcs", "version": __version__},
         "camera": camera,
         "catalog": catalog,
-        "detectors": {t.detector: _plain_distortion(t.distortion) for t in truths},
+        "detectors": {name: _plain_distortion(one) for name, one in distortions.items()},
         "frames": {
             t.name: {
                 "detector": t.detector,
