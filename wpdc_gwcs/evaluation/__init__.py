@@ -8,6 +8,7 @@ from wpdc_gwcs.evaluation.residuals import (
     evaluate,
     running_statistics,
 )
+from wpdc_gwcs.evaluation.uncorrected import uncorrected_residuals
 from wpdc_gwcs.evaluation.weights import WeightResult, compare_weights, tabulate_weights
 from wpdc_gwcs.robust import robust_scatter
 
@@ -23,4 +24,5 @@ __all__ = [
     "robust_scatter",
     "running_statistics",
     "tabulate_weights",
+    "uncorrected_residuals",
 ]
