@@ -200,6 +200,12 @@ def test_evaluate_some_weights(results, tmp_path, capsys):
     assert run([*command, "--weights", "w1, inverse", "--degree", "4"]) == 0
     found = Table.read(tmp_path / "all.weights.ecsv")
     assert sorted(set(found["weight"])) == ["exp-sqrt", "inverse"]
+    inner = tmp_path / "inner.ecsv"
+    command = ["evaluate", str(results / "out"), "--output", str(inner), "--max-radius", "200"]
+    assert run([*command, "--weights", "w1"]) == 0
+    near = Table.read(tmp_path / "inner.weights.ecsv")
+    # A circle of 200 px on 600 x 600 px.
+    assert near["n"][0] / found["n"][0] == pytest.approx(np.pi * 200**2 / 600**2, rel=0.15)
     capsys.readouterr()
 
 

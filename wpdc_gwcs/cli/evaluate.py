@@ -171,7 +171,7 @@ def evaluate_command(
     if not rows:
         raise InputError(f"no star of {len(frames)} frames is within the limits given")
     tables["frames"] = QTable(rows)
-    compared = _compare_weights(known, names, degree) if parts["weights"] else {}
+    compared = _compare_weights(known, names, degree, cuts) if parts["weights"] else {}
     if compared:
         tables["weights"] = _table_of_weights(compared)
     if plots is not None:
@@ -317,20 +317,29 @@ class _EvaluatedFrame:
         return np.asarray(self.matches[name], bool)
 
 
-def _compare_weights(calibrations, weights, degree):
-    """Detector to results of the weights, for the frames whose calibration is known."""
+def _compare_weights(calibrations, weights, degree, cuts):
+    """Detector to results of the weights, for the frames whose calibration is known.
+
+    All stars are fitted; what is shown is within the limits on places.
+    """
     from wpdc_gwcs.evaluation import compare_weights
 
     groups = {}
     for c in calibrations:
         groups.setdefault(c.solution.detector, []).append(c)
     try:
-        return {
+        found = {
             detector: compare_weights(group, weights=weights, degree=degree)
             for detector, group in groups.items()
         }
     except FitError as err:
         raise InputError(f"{err} (--no-weights leaves this out)") from err
+    return {
+        detector: [
+            r.select(cuts.place(r.x, r.y, groups[detector][0].solution.crpix)) for r in results
+        ]
+        for detector, results in found.items()
+    }
 
 
 def _table_of_weights(compared):

@@ -16,6 +16,7 @@ from wpdc_gwcs.evaluation.residuals import (
     running_statistics,
 )
 from wpdc_gwcs.evaluation.truth import TruthScore, pool_scores, score_frame, tabulate_scores
+from wpdc_gwcs.evaluation.uncorrected import uncorrected_residuals
 from wpdc_gwcs.evaluation.weights import WeightResult, compare_weights, tabulate_weights
 from wpdc_gwcs.robust import robust_scatter
 
@@ -40,4 +41,5 @@ __all__ = [
     "tabulate_detectors",
     "tabulate_scores",
     "tabulate_weights",
+    "uncorrected_residuals",
 ]
