@@ -1,5 +1,7 @@
 """Cameras that are ready: one detector of any kind, the CSST's Main Survey Camera, 90Prime."""
 
+from dataclasses import replace
+
 import astropy.units as u
 import numpy as np
 
@@ -10,6 +12,10 @@ __all__ = ["CAMERAS", "USUAL", "make_camera"]
 
 # Size of the quintic against the cubic radial distortion at the rim of a focal plane.
 _QUINTIC = 0.15
+
+# Distance from the axis, in half-widths, where a detector's own terms have the size that they have
+# for a single detector.
+_TERMS_AT = 3.2
 
 # Rows of five, from the bottom up, and the four columns of the Main Survey Camera that have
 # imaging detectors, from left to right.  The rest of its 30 detectors are for spectra.
@@ -176,7 +182,10 @@ def _with_optics(places, shape, distortion, waves, seed):
     drawn = []
     for place, rng in zip(places.values(), streams[1:], strict=True):
         x, y = np.subtract(axis, place["center"]) * place.get("axes", (1, 1)) / half
-        drawn.append(Distortion.off_axis(shape, complex(x, y), quintic=quintic, rng=rng))
+        one = Distortion.off_axis(shape, complex(x, y), quintic=quintic, rng=rng)
+        # What is a detector's own grows towards the rim with what is common.
+        own = max(np.hypot(x, y), 1.0) / _TERMS_AT
+        drawn.append(replace(one, terms={key: own * c for key, c in one.terms.items()}))
     gain = distortion / max(one.greatest() for one in drawn)
     detectors = []
     for (name, place), one, rng in zip(places.items(), drawn, streams[1:], strict=True):
