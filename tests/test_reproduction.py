@@ -16,6 +16,9 @@ SMALL = Scale(
     camera={"image_shape": (512, 512), "pixel_scale": 0.6 * u.arcsec, "distortion": 11.0},
     r0=220.0,
     slice_width=64.0,
+    n_bass=2,
+    r0_bass=200.0,
+    bass={"image_shape": (400, 420), "distortion": 4.0, "density": 100.0},
 )
 
 
@@ -86,6 +89,19 @@ def test_weights(made):
     assert {p.name for p in (folder / "weights").iterdir()} > {"weights.png", "slices.png"}
 
 
+def test_bass(made):
+    folder, results = made
+    assert value(results, "all", "sigma_alpha", "paper") == 5.494
+    for item in ("all", "cubic"):
+        # 454 mas to the pixel; centroids are good to 0.01 to 0.02 px.
+        assert 3 < value(results, item, "sigma_alpha") < 15
+        assert abs(value(results, item, "mean_delta")) < 1
+    error = {c: value(results, "all", "wcs_delta", c) for c in ("ours", "literal")}
+    assert error["ours"] < 4
+    assert error["ours"] < error["literal"]
+    assert len(list((folder / "bass").glob("sky-offsets-*.png"))) == 3
+
+
 def test_one_table_for_all(made):
     folder, results = made
     written = Table.read(folder / "results.ecsv")
@@ -93,14 +109,14 @@ def test_one_table_for_all(made):
     np.testing.assert_allclose(written["ours"], results["ours"])
     with pytest.raises(InputError, match="results.ecsv: file exists"):
         reproduce(["weights"], folder, scale=SMALL)
-    with pytest.raises(InputError, match="part must be one of detectors, weights, got 'bass9'"):
+    with pytest.raises(InputError, match="part must be one of detectors, bass, .* got 'bass9'"):
         reproduce(["bass9"], folder)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["all9"], "PART must be one of detectors, weights or all, got 'all9'"),
+        (["all9"], "PART must be one of detectors, bass, weights or all, got 'all9'"),
         (["all", "--jobs", "0"], "--jobs must be at least 1, got 0"),
         (["all", "--seed", "-1"], "--seed must be 0 or more, got -1"),
     ],

@@ -6,6 +6,7 @@ from astropy.table import vstack
 
 from wpdc_gwcs.exceptions import InputError
 from wpdc_gwcs.io import write_table
+from wpdc_gwcs.reproduction.bass import reproduce_bass
 from wpdc_gwcs.reproduction.claims import CLAIMS, Claim
 from wpdc_gwcs.reproduction.detectors import reproduce_detectors
 from wpdc_gwcs.reproduction.results import tabulate_results
@@ -20,13 +21,18 @@ __all__ = [
     "Claim",
     "Scale",
     "reproduce",
+    "reproduce_bass",
     "reproduce_detectors",
     "reproduce_weights",
     "tabulate_results",
 ]
 
 #: Name of a part to the function that makes it.
-PARTS = {"detectors": reproduce_detectors, "weights": reproduce_weights}
+PARTS = {
+    "detectors": reproduce_detectors,
+    "bass": reproduce_bass,
+    "weights": reproduce_weights,
+}
 
 
 def reproduce(parts, folder, *, scale=FULL, seed=1, jobs=1, overwrite=False, progress=None):

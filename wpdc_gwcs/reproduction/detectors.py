@@ -16,12 +16,12 @@ from wpdc_gwcs.evaluation import (
     format_table,
     pool_residuals,
     pool_scores,
-    score_frame,
     uncorrected_residuals,
 )
 from wpdc_gwcs.io import atomic_path, write_table
 from wpdc_gwcs.plotting import plot_before_after, plot_focal_plane
 from wpdc_gwcs.reproduction.results import tabulate_results
+from wpdc_gwcs.reproduction.scoring import CLOSE_PX, score_run
 from wpdc_gwcs.simulation import simulate
 
 __all__ = ["METHODS", "calibrate_fields", "reproduce_detectors", "simulate_fields"]
@@ -30,7 +30,6 @@ __all__ = ["METHODS", "calibrate_fields", "reproduce_detectors", "simulate_field
 METHODS = {"literal": "paper", "ours": "wpdc"}
 # The detector that the paper shows.
 _SHOWN = "g-1"
-_CLOSE_PX = 0.01
 
 
 def simulate_fields(detector, scale, *, seed):
@@ -89,16 +88,6 @@ def calibrate_fields(simulation, scale, *, method="wpdc", jobs=1, **settings):
     )
 
 
-def _score(simulation, run):
-    truths = {exposure.name: exposure for exposure in simulation.exposures}
-    scores = []
-    for calibration in run.calibrations:
-        stars = truths[calibration.frame].observe()[1]
-        stars.rename_column("reference_index", "catalog_index")
-        scores.append(score_frame(calibration, truths[calibration.frame], stars, limit=_CLOSE_PX))
-    return pool_scores(scores)[0]
-
-
 def _quantities(pooled, score):
     s = pooled.statistics
     moments = ("mean_dx", "sigma_dx", "mean_dy", "sigma_dy")
@@ -144,9 +133,9 @@ def reproduce_detectors(folder, scale, *, seed=1, jobs=1, progress=None):
         numbers = {}
         for name, method in METHODS.items():
             run = calibrate_fields(simulation, scale, method=method, jobs=jobs)
-            residuals = pool_residuals(run.calibrations, limit=_CLOSE_PX)[0]
+            residuals = pool_residuals(run.calibrations, limit=CLOSE_PX)[0]
             pooled[name].append(residuals)
-            numbers[name] = _quantities(residuals, _score(simulation, run))
+            numbers[name] = _quantities(residuals, pool_scores(score_run(simulation, run))[0])
             if detector == _SHOWN:
                 numbers[name] |= _draw_shown(run, name, folder)
             if name == "ours":

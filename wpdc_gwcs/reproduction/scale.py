@@ -29,6 +29,12 @@ class Scale:
         Radius within which all stars weigh the same, px.
     slice_width : float
         Width of the slices of the detector, px.
+    n_bass : int
+        Exposures of the four chips of 90Prime.
+    r0_bass : float
+        The same radius on its chips, px.
+    bass : dict
+        Options of the camera ``bass-90prime`` and of its field, empty for its own size.
     """
 
     detectors: tuple[str, ...] = DETECTORS
@@ -37,6 +43,9 @@ class Scale:
     camera: dict = field(default_factory=dict)
     r0: float = 4000.0
     slice_width: float = 512.0
+    n_bass: int = 10
+    r0_bass: float = 2000.0
+    bass: dict = field(default_factory=dict)
 
     def fields(self, seed):
         """Choose where on the sky the fields are, and how rich.
@@ -69,4 +78,7 @@ QUICK = Scale(
     camera={"image_shape": (1026, 1024), "pixel_scale": 0.3 * u.arcsec, "distortion": 22.0},
     r0=444.0,
     slice_width=57.0,
+    n_bass=3,
+    r0_bass=250.0,
+    bass={"image_shape": (512, 504), "distortion": 5.0, "density": 100.0},
 )
