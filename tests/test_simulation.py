@@ -8,7 +8,13 @@ from astropy.wcs import WCS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wpdc_gwcs.simulation import Distortion, simulate, write_simulation
+from wpdc_gwcs.simulation import (
+    Distortion,
+    KingCluster,
+    make_camera,
+    simulate,
+    write_simulation,
+)
 
 SMALL = {"image_shape": (220, 300), "pixel_scale": 1.0 * u.arcsec, "distortion": 8.0}
 
@@ -164,14 +170,24 @@ def test_reference_limit():
     assert np.abs(x - sources["x"]).max() < 1
 
 
-def test_cluster_crowds_the_centre():
-    def central(cluster):
-        stars = simulate(
-            1, density=20, cluster=cluster, cluster_radius=15 * u.arcsec, **SMALL
-        ).exposures[0]
-        return np.mean(np.hypot(stars.stars["x"] - 150, stars.stars["y"] - 110) < 40)
+def test_cluster_has_the_density_of_king():
+    king = KingCluster(density=3000, core_radius=20 * u.arcsec, tidal_radius=90 * u.arcsec)
+    exposure = simulate(1, density=0, cluster=king, pointing_error=0 * u.arcsec, **SMALL).exposures[
+        0
+    ]
+    x, y = exposure.distortion.undistort(exposure.stars["x"], exposure.stars["y"])
+    r = np.hypot(x - 149.5, y - 109.5)  # px of one arcsec
+    assert 60 < r.max() < 90.5
 
-    assert central(0.5) > 3 * central(0.0)
+    def surface(r):
+        edge = 1 / np.hypot(1, 90 / 20)
+        return ((1 / np.hypot(1, r / 20) - edge) / (1 - edge)) ** 2
+
+    for low, high in ((0, 10), (10, 20), (20, 40), (40, 80)):
+        fine = np.linspace(low, high, 4001)
+        expected = np.trapezoid(2 * np.pi * fine * 3000 / 3600 * surface(fine), fine)
+        count = np.sum((r >= low) & (r < high))
+        assert abs(count - expected) < 4 * np.sqrt(expected)
 
 
 @pytest.mark.parametrize(
@@ -183,6 +199,15 @@ def test_cluster_crowds_the_centre():
         ({"image_shape": (10, 100)}, "image_shape must be at least 16 px"),
         ({"magnitudes": (20, 15)}, "magnitudes must be"),
         ({"lost": 2}, "lost must be between 0 and 1, not 2"),
+        ({"seed": -1}, "seed must be 0 or more, not -1"),
+        ({"density": [1, 2]}, r"density must be one number, or one for each field \(1\)"),
+        ({"epoch": [2016, 2017]}, r"epoch must be one number, or one for each exposure \(5\)"),
+        ({"density": 1e9}, "density must give fewer than 100,000,000 stars"),
+        ({"galaxies": -1}, "galaxies must be not negative, not -1"),
+        ({"camera": "hst"}, "camera must be one of generic, csst-msc, bass-90prime, not hst"),
+        ({"camera": "csst-msc", "detectors": ["g-9"]}, "detectors must be among y-1, .*not g-9"),
+        ({"camera": "csst-msc", "detector": "a"}, "detector must be left out for a camera"),
+        ({"dither": np.nan * u.deg}, "dither must be finite"),
     ],
 )
 def test_bad_options(options, message):
@@ -193,6 +218,24 @@ def test_bad_options(options, message):
 def test_scale_needs_a_unit():
     with pytest.raises(TypeError, match="pixel_scale must be a Quantity in arcsec"):
         simulate(1, pixel_scale=0.3)
+
+
+def test_options_that_no_camera_has():
+    with pytest.raises(TypeError, match="simulate has no option pixelscale"):
+        simulate(1, pixelscale=0.3 * u.arcsec)
+    with pytest.raises(TypeError, match="a camera of your own has its options already, not fwhm"):
+        simulate(1, camera=make_camera(), fwhm=3.0)
+    with pytest.raises(TypeError, match="cluster must be a KingCluster or None, not 0.5"):
+        simulate(1, cluster=0.5)
+
+
+@pytest.mark.parametrize(
+    ("radii", "message"),
+    [((0, 5), "core_radius must be positive"), ((5, 4), "tidal_radius must be above core_radius")],
+)
+def test_impossible_cluster(radii, message):
+    with pytest.raises(ValueError, match=message):
+        KingCluster(10.0, *(radii * u.arcsec))
 
 
 # ---- images

@@ -1,7 +1,18 @@
 """The command line: `wpdc`."""
 
 # The commands register themselves with the application.
-from wpdc_gwcs.cli import calibrate, catalog, demo, export, files, report, stages  # noqa: F401
+from wpdc_gwcs.cli import (  # noqa: F401
+    calibrate,
+    catalog,
+    demo,
+    evaluate,
+    export,
+    files,
+    report,
+    reproduce,
+    simulate,
+    stages,
+)
 from wpdc_gwcs.cli.app import app, main
 
 __all__ = ["app", "main"]

@@ -1,4 +1,4 @@
-"""`wpdc simulate` and `wpdc demo`: frames whose distortion is known."""
+"""`wpdc demo`: from a simulation to a WCS that is held against the truth."""
 
 import time
 from pathlib import Path
@@ -10,87 +10,11 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_plotting
 from wpdc_gwcs.cli.progress import progress_bar
+from wpdc_gwcs.cli.simulate import write_files
 from wpdc_gwcs.exceptions import InputError
 
 # The demo fails if the delivered WCS is further off its own truth than this, px rms.
 DEMO_LIMIT = 0.02
-
-
-@app.command("simulate", no_args_is_help=True)
-def simulate_command(
-    output: Annotated[
-        Path, typer.Option("--output", metavar="DIR", help="Folder to write to; made if needed.")
-    ],
-    exposures: Annotated[int, typer.Option(metavar="N", help="Dithered exposures.")] = 5,
-    images: Annotated[
-        int, typer.Option(metavar="N", help="How many of them are images; the rest are lists.")
-    ] = 1,
-    size: Annotated[int, typer.Option(metavar="PX", help="Side of the square detector.")] = 2048,
-    distortion: Annotated[
-        float, typer.Option(metavar="PX", help="Greatest displacement by distortion.")
-    ] = 40.0,
-    waves: Annotated[
-        float, typer.Option(metavar="PX", help="Amplitude of fine structure no cubic can take.")
-    ] = 0.0,
-    density: Annotated[float, typer.Option(metavar="N", help="Stars per square arcmin.")] = 20.0,
-    pixel_scale: Annotated[float, typer.Option(metavar="ARCSEC", help="Pixel scale.")] = 0.3,
-    seed: Annotated[int, typer.Option(metavar="N", help="Another seed, another camera.")] = 1,
-    overwrite: Overwrite = False,
-    verbose: Verbose = 0,
-    quiet: Quiet = False,
-):
-    """Simulate exposures with a known distortion: images, FITS_LDAC lists and a reference."""
-    from astropy import units as u
-
-    from wpdc_gwcs.simulation import simulate
-
-    try:
-        simulation = simulate(
-            exposures,
-            image_shape=(size, size),
-            distortion=distortion,
-            waves=waves,
-            density=density,
-            pixel_scale=pixel_scale * u.arcsec,
-            seed=seed,
-        )
-    except ValueError as err:
-        raise InputError(str(err)) from err
-    if not 0 <= images <= exposures:
-        raise InputError(f"--images must be between 0 and {exposures}, got {images}")
-    files = write_files(simulation, output, images=range(images), overwrite=overwrite)
-    if not quiet:
-        frames = " ".join(map(str, files["frames"]))
-        typer.echo(f"wpdc calibrate {frames} --catalog {files['reference']} --output results")
-
-
-def write_files(simulation, folder, *, images, overwrite):
-    """Write a simulation, with errors that the command line can show.
-
-    Parameters
-    ----------
-    simulation : Simulation
-        What to write.
-    folder : Path
-        Where to.
-    images : sequence of int
-        Exposures that are rendered.
-    overwrite : bool
-        Replace files.
-
-    Returns
-    -------
-    dict
-        See `wpdc_gwcs.simulation.write_simulation`.
-    """
-    from wpdc_gwcs.simulation import write_simulation
-
-    try:
-        return write_simulation(
-            simulation, folder, images=images, sources="ldac", overwrite=overwrite
-        )
-    except FileExistsError as err:
-        raise InputError(f"{err}: replaced only with --overwrite") from err
 
 
 @app.command("demo")

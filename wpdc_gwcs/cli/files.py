@@ -1,7 +1,5 @@
-"""Commands on results: `pix2sky`, `sky2pix`, `evaluate`, `monitor`."""
+"""Commands on results: `pix2sky`, `sky2pix`, `monitor`."""
 
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +7,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
-from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free, require_plotting
+from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose
 from wpdc_gwcs.exceptions import InputError
 
 CalibrationFile = Annotated[
@@ -139,142 +137,6 @@ def _transform_table(path, names, transform, output, overwrite):
         write_table(table, output, overwrite=overwrite)
 
 
-@app.command("evaluate", no_args_is_help=True)
-def evaluate_command(
-    paths: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="PATH...", help="*.matches.ecsv files, *.wcs.asdf files, or result folders."
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            metavar="FILE",
-            help="Write the tables instead of printing them: that of the frames here, that of the "
-            "weights into FILE with .weights before its suffix.",
-        ),
-    ] = None,
-    plots: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Also write figures of the residuals into this folder."),
-    ] = None,
-    no_weights: Annotated[
-        bool,
-        typer.Option(
-            "--no-weights",
-            help="Do not fit the polynomial anew with each of the five radial weights.",
-        ),
-    ] = False,
-    overwrite: Overwrite = False,
-    verbose: Verbose = 0,
-    quiet: Quiet = False,
-):
-    """Residuals of calibrated frames: clipped moments, d80, scatter; held-out stars apart.
-
-    Then the same for all frames of a detector with each of the five radial weights, without and
-    with a table, from the *.wcs.asdf files beside the matches.
-    """
-    from astropy.table import QTable
-
-    from wpdc_gwcs.evaluation import evaluate
-    from wpdc_gwcs.io import write_table
-
-    if plots is not None:
-        require_plotting("--plots")
-    frames = [
-        _EvaluatedFrame(path, not no_weights or plots is not None) for path in match_files(paths)
-    ]
-    compares = not no_weights and any(frame.calibration is not None for frame in frames)
-    if output is not None:
-        files = {"frames": output}
-        if compares:
-            files["weights"] = output.with_suffix(".weights" + output.suffix)
-        for file in files.values():
-            require_free(file, overwrite)
-    compared = _compare_weights(frames) if compares else {}
-    tables = {}
-    rows = []
-    for frame in frames:
-        for stars, mask in (("used", frame.flag("used")), ("holdout", frame.flag("holdout"))):
-            if mask.any():
-                dx, dy = (np.asarray(frame.matches[name])[mask] for name in ("dx", "dy"))
-                rows.append(dict(frame=frame.name, stars=stars, **vars(evaluate(dx, dy))))
-    tables["frames"] = QTable(rows)
-    if compared:
-        tables["weights"] = _table_of_weights(compared)
-    if plots is not None:
-        _write_plots(frames, compared, plots, overwrite=overwrite)
-    if output is not None:
-        for name, table in tables.items():
-            write_table(table, files[name], overwrite=overwrite)
-    if not quiet and output is None:
-        for k, table in enumerate(tables.values()):
-            if k:
-                typer.echo()
-            _print_statistics(table)
-
-
-def _print_statistics(table):
-    """Print statistics, the numbers of stars first, then px with four digits."""
-    words = [name for name in table.colnames if table[name].dtype.kind == "U"]
-    for name in table.colnames:
-        if table[name].dtype.kind == "f":
-            table[name].info.format = ".0f" if name == "r0" else ".4f"
-    align = ["<" if name in words else ">" for name in table.colnames]
-    for line in table.pformat(max_lines=-1, max_width=-1, align=align):
-        typer.echo(line)
-
-
-class _EvaluatedFrame:
-    """Matches of a frame, and its calibration where that is beside them."""
-
-    def __init__(self, path, with_calibration):
-        from wpdc_gwcs.io import read, read_matches
-
-        self.name = path.name.removesuffix(".matches.ecsv")
-        self.matches = read_matches(path)
-        beside = path.with_name(f"{self.name}.wcs.asdf")
-        self.calibration = None
-        if with_calibration and beside.exists():
-            calibration = read(beside)
-            runs = calibration.provenance.get("run"), self.matches.meta.get("run")
-            if runs[0] != runs[1]:
-                raise InputError(
-                    f"{path}: must be of the same run as {beside.name}, {runs[0]}, is of {runs[1]}"
-                )
-            self.calibration = replace(calibration, matches=self.matches)
-
-    def flag(self, name):
-        return np.asarray(self.matches[name], bool)
-
-
-def _compare_weights(frames):
-    """Detector to results of the five weights, for the frames whose calibration is known."""
-    from wpdc_gwcs.evaluation import compare_weights
-
-    groups = {}
-    for frame in frames:
-        if frame.calibration is not None:
-            detector = frame.calibration.solution.detector
-            groups.setdefault(detector, []).append(frame.calibration)
-    return {detector: compare_weights(group) for detector, group in groups.items()}
-
-
-def _table_of_weights(compared):
-    from astropy.table import vstack
-
-    from wpdc_gwcs.evaluation import tabulate_weights
-
-    tables = []
-    for detector, results in compared.items():
-        table = tabulate_weights(results)
-        table.add_column(np.full(len(table), detector), name="detector", index=0)
-        tables.append(table)
-    return vstack(tables)
-
-
 def match_files(paths):
     """Match tables behind files and folders, in order.
 
@@ -302,35 +164,6 @@ def match_files(paths):
             raise InputError(f"{path}: no such file")
         found.append(path)
     return found
-
-
-def _write_plots(frames, compared, folder, *, overwrite):
-    from wpdc_gwcs import plotting
-    from wpdc_gwcs.calibration.results import file_stem
-
-    figures = {}
-    for frame in frames:
-        m = frame.matches
-        figures[f"{frame.name}.residuals.png"] = partial(plotting.plot_residuals_vs_position, m)
-        figures[f"{frame.name}.magnitude.png"] = partial(plotting.plot_residuals_vs_magnitude, m)
-        figures[f"{frame.name}.cdf.png"] = partial(plotting.plot_cdf, m)
-        if frame.calibration is not None:
-            shape = frame.calibration.solution.image_shape
-            figures[f"{frame.name}.maps.png"] = partial(
-                plotting.plot_residual_maps, m, image_shape=shape
-            )
-    for detector, results in compared.items():
-        figures[f"{file_stem(detector)}.weights.png"] = partial(plotting.plot_weights, results)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as err:
-        raise InputError(
-            f"{folder}: the folder of --plots must be writable: {err.strerror}"
-        ) from err
-    for name in figures:
-        require_free(folder / name, overwrite)
-    for name, plot in figures.items():
-        plot().savefig(folder / name, dpi=110)
 
 
 @app.command("monitor", no_args_is_help=True)

@@ -1,6 +1,7 @@
 """Options that several commands share, and the files and presets they may come from."""
 
 import logging
+import math
 import tomllib
 from importlib.resources import files
 from importlib.util import find_spec
@@ -32,6 +33,7 @@ __all__ = [
     "Threshold",
     "Verbose",
     "by_hand",
+    "read_numbers",
     "state_first_pixel",
     "WeightMap",
     "require_free",
@@ -264,6 +266,36 @@ def by_hand(epoch, pixel_scale, origin):
     except ValueError as problem:
         raise InputError(f"--{problem}") from problem
     return {"epoch": year, "pixel_scale": pixel_scale, "origin": origin}
+
+
+def read_numbers(option, text, n=None, separator=","):
+    """Read the numbers of an option that has several.
+
+    Parameters
+    ----------
+    option : str
+        Name of the option.
+    text : str
+        What was typed.
+    n : int, optional
+        How many there must be.
+    separator : str, optional
+        What stands between them.
+
+    Returns
+    -------
+    tuple of float
+        The numbers, all finite.
+    """
+    try:
+        numbers = tuple(float(part) for part in text.split(separator))
+    except ValueError:
+        numbers = ()
+    if not numbers or n not in (None, len(numbers)) or not all(map(math.isfinite, numbers)):
+        what = {None: "numbers", 1: "a number"}.get(n, f"{n} numbers")
+        between = "" if n == 1 else f" with {separator!r} between them"
+        raise InputError(f"{option} must be {what}{between}, got {text!r}")
+    return numbers
 
 
 def state_first_pixel(frames):

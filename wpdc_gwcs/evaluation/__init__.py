@@ -1,6 +1,13 @@
-"""Residuals: statistics, maps, the radial weights side by side, drift of a stored table."""
+"""Residuals of frames, detectors and runs; radial weights side by side; drift; the truth."""
 
+from wpdc_gwcs.evaluation.cuts import Cuts
 from wpdc_gwcs.evaluation.drift import Drift, detect_drift
+from wpdc_gwcs.evaluation.pooled import (
+    DetectorResiduals,
+    format_table,
+    pool_residuals,
+    tabulate_detectors,
+)
 from wpdc_gwcs.evaluation.residuals import (
     ResidualStatistics,
     binned_residuals,
@@ -8,19 +15,31 @@ from wpdc_gwcs.evaluation.residuals import (
     evaluate,
     running_statistics,
 )
+from wpdc_gwcs.evaluation.truth import TruthScore, pool_scores, score_frame, tabulate_scores
+from wpdc_gwcs.evaluation.uncorrected import uncorrected_residuals
 from wpdc_gwcs.evaluation.weights import WeightResult, compare_weights, tabulate_weights
 from wpdc_gwcs.robust import robust_scatter
 
 __all__ = [
+    "Cuts",
+    "DetectorResiduals",
     "Drift",
     "ResidualStatistics",
+    "TruthScore",
     "WeightResult",
     "binned_residuals",
     "compare_weights",
     "d80",
     "detect_drift",
     "evaluate",
+    "format_table",
+    "pool_residuals",
+    "pool_scores",
     "robust_scatter",
     "running_statistics",
+    "score_frame",
+    "tabulate_detectors",
+    "tabulate_scores",
     "tabulate_weights",
+    "uncorrected_residuals",
 ]

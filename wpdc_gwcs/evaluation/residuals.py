@@ -14,6 +14,7 @@ __all__ = [
     "d80",
     "evaluate",
     "running_statistics",
+    "within_sigma",
 ]
 
 
@@ -115,8 +116,7 @@ def evaluate(dx, dy, *, sigma=3.0):
     dx, dy = dx[finite], dy[finite]
     if dx.size == 0:
         return ResidualStatistics(0, 0, *[np.nan] * 9)
-    clip = SigmaClip(sigma=sigma, maxiters=None)
-    keep = ~(np.ma.getmaskarray(clip(dx)) | np.ma.getmaskarray(clip(dy)))
+    keep = within_sigma(dx, dy, sigma=sigma)
     x, y = dx[keep], dy[keep]
     return ResidualStatistics(
         n=int(dx.size),
@@ -131,6 +131,25 @@ def evaluate(dx, dy, *, sigma=3.0):
         d80_dy=d80(dy),
         rms=float(np.sqrt(np.mean(x**2 + y**2))),
     )
+
+
+def within_sigma(dx, dy, *, sigma=3.0):
+    """Mark the residuals that a clipping leaves.
+
+    Parameters
+    ----------
+    dx, dy : (N,) ndarray
+        Finite residuals of both axes.
+    sigma : float, optional
+        Clipping limit in standard deviations.
+
+    Returns
+    -------
+    (N,) ndarray of bool
+        True for those that neither axis clips.
+    """
+    clip = SigmaClip(sigma=sigma, maxiters=None)
+    return ~(np.ma.getmaskarray(clip(dx)) | np.ma.getmaskarray(clip(dy)))
 
 
 def binned_residuals(x, y, dx, dy, *, image_shape, n_bins=20):

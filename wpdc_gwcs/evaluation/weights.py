@@ -7,7 +7,7 @@
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy.table import QTable
@@ -39,6 +39,10 @@ class WeightResult:
         Of the former and of the latter.
     held_out : bool
         Whether the residuals are those of held-out stars; if not, of the stars in the fit.
+    x, y : (N,) ndarray, optional
+        Pixels of the stars, zero based.
+    distance : (N,) ndarray, optional
+        Their distances from the reference point, px.
     """
 
     weight: RadialWeight
@@ -49,6 +53,54 @@ class WeightResult:
     statistics: ResidualStatistics
     table_statistics: ResidualStatistics
     held_out: bool
+    x: np.ndarray | None = None
+    y: np.ndarray | None = None
+    distance: np.ndarray | None = None
+
+    def within(self, radius):
+        """Select the stars within a distance of the reference point.
+
+        Parameters
+        ----------
+        radius : float
+            Distance in px, such as ``weight.r0``.
+
+        Returns
+        -------
+        WeightResult
+            Of these stars alone.
+
+        Raises
+        ------
+        ValueError
+            If the distances of the stars are not known, or no star is as near.
+        """
+        near = None if self.distance is None else self.distance <= radius
+        if near is None or not near.any():
+            raise ValueError(f"no star is known within {radius:g} px of the reference point")
+        return self.select(near)
+
+    def select(self, chosen):
+        """Select some of the stars.
+
+        Parameters
+        ----------
+        chosen : (N,) ndarray of bool
+            Which.
+
+        Returns
+        -------
+        WeightResult
+            Of these stars alone.
+        """
+        columns = ("dx", "dy", "table_dx", "table_dy", "x", "y", "distance")
+        arrays = {name: getattr(self, name)[chosen] for name in columns}
+        return replace(
+            self,
+            **arrays,
+            statistics=evaluate(arrays["dx"], arrays["dy"]),
+            table_statistics=evaluate(arrays["table_dx"], arrays["table_dy"]),
+        )
 
 
 @one_blas_thread
@@ -158,6 +210,8 @@ def compare_weights(calibrations, *, weights=RadialWeight.names, r0=None, degree
                 evaluate(*residual[:, shown]),
                 evaluate(*left[:, shown]),
                 bool(held.any()),
+                *place[:, shown],
+                np.hypot(*offset[:, shown]),
             )
         )
     return results

@@ -11,9 +11,36 @@ The header of an exposure holds the nominal attitude; the true one differs from 
 roll and scale errors.
 """
 
+from importlib import import_module
+
+from wpdc_gwcs.simulation.camera import SimulatedCamera, SimulatedDetector
 from wpdc_gwcs.simulation.distortion import Distortion
 from wpdc_gwcs.simulation.exposure import SimulatedExposure
 from wpdc_gwcs.simulation.field import Simulation, simulate
-from wpdc_gwcs.simulation.files import write_simulation
+from wpdc_gwcs.simulation.presets import CAMERAS, make_camera
+from wpdc_gwcs.simulation.stars import KingCluster
+from wpdc_gwcs.simulation.truth import FrameTruth
 
-__all__ = ["Distortion", "SimulatedExposure", "Simulation", "simulate", "write_simulation"]
+__all__ = [
+    "CAMERAS",
+    "Distortion",
+    "FrameTruth",
+    "KingCluster",
+    "SimulatedCamera",
+    "SimulatedDetector",
+    "SimulatedExposure",
+    "Simulation",
+    "make_camera",
+    "read_truth",
+    "simulate",
+    "write_simulation",
+]
+
+# What touches files stands with the files, above this package; resolved on first use.
+_IN_FILES = ("read_truth", "write_simulation")
+
+
+def __getattr__(name):
+    if name in _IN_FILES:
+        return getattr(import_module("wpdc_gwcs.io.simulations"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

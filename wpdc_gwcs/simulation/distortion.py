@@ -1,10 +1,17 @@
 """A distortion of one detector in closed form, with its exact inverse."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import comb
 
 import numpy as np
 
 __all__ = ["Distortion"]
+
+# Points at a time: their powers stay in the cache of a processor.
+_BLOCK = 4096
+# Newton's steps end below this, in half-widths of the detector.
+_LAST_STEP = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,42 +78,121 @@ class Distortion:
             If the distortion asked for would fold the detector over itself.
         """
         rng = np.random.default_rng(rng)
-        half = max(image_shape) / 2
         axis = rng.uniform(1.5, 3.5) * np.exp(2j * np.pi * rng.uniform())
-        radial = (1.0, rng.uniform(-0.02, 0.02))
-        terms = {
-            (m, order - m): 4.0 * 0.4**order * complex(*rng.normal(size=2))
-            for order in range(2, 7)
-            for m in range(order + 1)
-        }
-        smooth = cls(image_shape, axis, radial, terms)
-        y, x = np.mgrid[0 : image_shape[0] : 65j, 0 : image_shape[1] : 65j] - 0.5
-        size = np.abs(smooth._displace(smooth._normalise(x, y))[0]).max() * half
-        k = amplitude / size
-        fine = []
-        for _ in range(6 if waves else 0):
-            length = rng.uniform(*wavelength) * 2  # in half-widths
-            fine.append(
-                (
-                    2 * np.pi / length * np.exp(1j * np.pi * rng.uniform()),
-                    rng.uniform(0, 2 * np.pi),
-                    complex(*rng.normal(size=2)) * waves / half,
-                )
-            )
-        distortion = cls(
-            image_shape,
-            axis,
-            (k * radial[0], k * radial[1]),
-            {key: k * c for key, c in terms.items()},
-            tuple(fine),
-        )
-        _, dz, dzbar = distortion._displace(distortion._normalise(x, y))
-        if (np.abs(1 + dz) - np.abs(dzbar)).min() < 0.2:
+        smooth = cls.off_axis(image_shape, axis, quintic=rng.uniform(-0.02, 0.02), rng=rng)
+        smooth = smooth.scaled(amplitude / smooth.greatest())
+        distortion = smooth.with_waves(waves, wavelength=wavelength, rng=rng)
+        if not distortion.invertible():
             raise ValueError(
                 f"a distortion of {amplitude:g} px (waves {waves:g} px) is not invertible "
                 f"on a detector of {image_shape[1]} x {image_shape[0]} px"
             )
         return distortion
+
+    @classmethod
+    def off_axis(cls, image_shape, axis, *, quintic=0.0, rng=None):
+        """Draw the distortion of a detector from an optical axis that is known.
+
+        Parameters
+        ----------
+        image_shape : (int, int)
+            Shape of the detector ``(ny, nx)``.
+        axis : complex
+            Where the optical axis is, in half-widths of the detector from its center.
+        quintic : float, optional
+            Quintic coefficient of the radial distortion; the cubic one is 1.
+        rng : `numpy.random.Generator`, optional
+            Source of the polynomial terms, smaller by 0.4 from order to order.
+
+        Returns
+        -------
+        Distortion
+            A distortion of arbitrary size: `scaled` gives it the one that is wanted.
+        """
+        rng = np.random.default_rng(rng)
+        terms = {
+            (m, order - m): 4.0 * 0.4**order * complex(*rng.normal(size=2))
+            for order in range(2, 7)
+            for m in range(order + 1)
+        }
+        return cls(image_shape, axis, (1.0, quintic), terms)
+
+    def scaled(self, factor):
+        """Give the same distortion with another size.
+
+        Parameters
+        ----------
+        factor : float
+            What all displacements are multiplied by.
+
+        Returns
+        -------
+        Distortion
+            The distortion.
+        """
+        return replace(
+            self,
+            radial=tuple(factor * k for k in self.radial),
+            terms={key: factor * c for key, c in self.terms.items()},
+            waves=tuple((kappa, phase, factor * a) for kappa, phase, a in self.waves),
+        )
+
+    def with_waves(self, amplitude, *, wavelength=(0.2, 0.65), rng=None):
+        """Add six fine waves.
+
+        Parameters
+        ----------
+        amplitude : float
+            Scatter of their amplitudes per axis, in pixels; 0 adds none.
+        wavelength : (float, float), optional
+            Range of their wavelengths, in units of the longer side.
+        rng : `numpy.random.Generator`, optional
+            Source of the numbers.
+
+        Returns
+        -------
+        Distortion
+            The distortion.
+        """
+        rng = np.random.default_rng(rng)
+        half = max(self.image_shape) / 2
+        fine = []
+        for _ in range(6 if amplitude else 0):
+            length = rng.uniform(*wavelength) * 2  # in half-widths
+            fine.append(
+                (
+                    2 * np.pi / length * np.exp(1j * np.pi * rng.uniform()),
+                    rng.uniform(0, 2 * np.pi),
+                    complex(*rng.normal(size=2)) * amplitude / half,
+                )
+            )
+        return replace(self, waves=self.waves + tuple(fine))
+
+    def greatest(self):
+        """Give the greatest displacement on the detector.
+
+        Returns
+        -------
+        float
+            In pixels, on a grid of 65 x 65 points from edge to edge.
+        """
+        return float(np.abs(self._on_grid()[0]).max() * max(self.image_shape) / 2)
+
+    def invertible(self):
+        """Tell whether no two pixels fall together.
+
+        Returns
+        -------
+        bool
+            Whether the Jacobian stays clear of zero on the detector.
+        """
+        _, dz, dzbar = self._on_grid()
+        return bool((np.abs(1 + dz) - np.abs(dzbar)).min() >= 0.2)
+
+    def _on_grid(self):
+        ny, nx = self.image_shape
+        y, x = np.mgrid[0:ny:65j, 0:nx:65j] - 0.5
+        return self._displace(self._normalise(x, y))
 
     @property
     def center(self):
@@ -124,30 +210,36 @@ class Distortion:
         half = max(self.image_shape) / 2
         return z.real * half + x0, z.imag * half + y0
 
-    def _radial(self, z):
-        k3, k5 = self.radial
-        s = z - self.axis
-        r2 = (s * s.conjugate()).real
-        return (
-            s * r2 * (k3 + k5 * r2),
-            r2 * (2 * k3 + 3 * k5 * r2),
-            s * s * (k3 + 2 * k5 * r2),
-        )
+    @cached_property
+    def coefficients(self):
+        """The radial and the polynomial terms together, ``c[m, n]`` of z^m conj(z)^n."""
+        order = max([5, *(m + n for m, n in self.terms)])
+        c = np.zeros((order + 1, order + 1), complex)
+        # (z - a)^(j + 1) conj(z - a)^j, j = 1 and 2, multiplied out.
+        for k, j in zip(self.radial, (1, 2)):
+            own = [comb(j + 1, m) * (-self.axis) ** (j + 1 - m) for m in range(j + 2)]
+            other = [comb(j, n) * (-np.conj(self.axis)) ** (j - n) for n in range(j + 1)]
+            c[: j + 2, : j + 1] += k * np.outer(own, other)
+        c[0, 0] = c[1, 0] = c[0, 1] = 0
+        for (m, n), value in self.terms.items():
+            c[m, n] += value
+        return c
 
     def _displace(self, z):
         """D, its derivative by z and its derivative by conj(z)."""
-        d, dz, dzbar = self._radial(z)
-        d0, dz0, dzbar0 = self._radial(0j)
-        c = np.conj(z)
-        d = d - d0 - dz0 * z - dzbar0 * c
-        dz = dz - dz0
-        dzbar = dzbar - dzbar0
-        for (m, n), a in self.terms.items():
-            d = d + a * z**m * c**n
-            if m:
-                dz = dz + a * m * z ** (m - 1) * c**n
-            if n:
-                dzbar = dzbar + a * n * z**m * c ** (n - 1)
+        c = self.coefficients
+        size = len(c)
+        conj = np.conj(z)
+        # Horner's rule in conj(z) over polynomials in z, each with its derivative.
+        d, dz, dzbar = np.zeros_like(z), np.zeros_like(z), np.zeros_like(z)
+        for n in range(size - 1, -1, -1):
+            row, slope = np.full_like(z, c[size - 1 - n, n]), np.zeros_like(z)
+            for m in range(size - 2 - n, -1, -1):
+                slope = slope * z + row
+                row = row * z + c[m, n]
+            dzbar = dzbar * conj + d
+            d = d * conj + row
+            dz = dz * conj + slope
         for kappa, phase, a in self.waves:
             angle = (np.conj(kappa) * z).real + phase
             d = d + a * np.sin(angle)
@@ -170,7 +262,7 @@ class Distortion:
             Undistorted pixel coordinates, zero based.
         """
         z = self._normalise(x, y)
-        return self._pixels(z + self._displace(z)[0])
+        return self._pixels(_in_blocks(lambda part: part + self._displace(part)[0], z))
 
     def distort(self, x, y):
         """Undistorted pixels to detector pixels, the inverse of `undistort`.
@@ -185,9 +277,12 @@ class Distortion:
         x, y : ndarray
             Detector pixel coordinates, zero based; NaN where there is no answer near the detector.
         """
-        target = self._normalise(x, y)
-        z = target.copy()
+        return self._pixels(_in_blocks(self._solve, self._normalise(x, y)))
+
+    def _solve(self, target):
+        """Invert z + D(z) by Newton's iteration; NaN where there is no answer near the detector."""
         reach = 3 + np.abs(target)
+        z = target
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             for _ in range(50):
                 d, dz, dzbar = self._displace(z)
@@ -195,7 +290,17 @@ class Distortion:
                 jacobian = np.abs(1 + dz) ** 2 - np.abs(dzbar) ** 2
                 step = (np.conj(1 + dz) * miss - dzbar * np.conj(miss)) / jacobian
                 z = np.where(np.abs(z) < reach, z + step, np.nan)
-                if not np.nanmax(np.abs(step), initial=0) > 1e-14:
+                # Convergence is quadratic: after a step this small nothing is left.
+                if not np.nanmax(np.abs(step), initial=0) > _LAST_STEP:
                     break
-            good = np.abs(target - z - self._displace(z)[0]) < 1e-11
-        return self._pixels(np.where(good, z, complex(np.nan, np.nan)))
+            good = np.abs(step) <= _LAST_STEP
+        return np.where(good, z, complex(np.nan, np.nan))
+
+
+def _in_blocks(function, z):
+    """Evaluate a function of complex points, a block of them at a time."""
+    flat = np.ravel(z)
+    result = np.empty_like(flat)
+    for start in range(0, flat.size, _BLOCK):
+        result[start : start + _BLOCK] = function(flat[start : start + _BLOCK])
+    return result.reshape(np.shape(z))

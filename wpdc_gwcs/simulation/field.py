@@ -1,122 +1,141 @@
-"""Star fields, and the exposures of one detector on them."""
+"""Exposures of a simulated camera on star fields, anywhere on the sky."""
 
 from dataclasses import dataclass
+from inspect import signature
 
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.io import fits
-from astropy.table import QTable, Table
-from astropy.time import Time
-from astropy.wcs import WCS
+from astropy.table import QTable, vstack
+from scipy.spatial import cKDTree
 
-from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.frozen import freeze_attributes
-from wpdc_gwcs.simulation._camera import SIGMA_PER_FWHM, Camera, find_zero_point
-from wpdc_gwcs.simulation.distortion import Distortion
+from wpdc_gwcs.simulation.camera import SimulatedCamera, require, value_of
 from wpdc_gwcs.simulation.exposure import SimulatedExposure
+from wpdc_gwcs.simulation.measurement import Measurement
+from wpdc_gwcs.simulation.pointing import Pointing, aim
+from wpdc_gwcs.simulation.presets import USUAL, make_camera
+from wpdc_gwcs.simulation.stars import (
+    CATALOG_EPOCH,
+    KingCluster,
+    make_reference,
+    make_stars,
+    offset_positions,
+)
+from wpdc_gwcs.sky import directions
 
 __all__ = ["Simulation", "simulate"]
-
-_MAS = np.deg2rad(1 / 3.6e6)  # rad
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Exposures of one detector on one field, made by `simulate`.
+    """Exposures of a camera on one or more fields, made by `simulate`.
 
     Parameters
     ----------
     reference : `astropy.table.QTable`
         Reference catalog with Gaia's column names: ``source_id``, ``ra``, ``dec``, ``ra_error``,
-        ``dec_error``, ``pmra``, ``pmdec``, ``ref_epoch``, ``phot_g_mean_mag``.
+        ``dec_error``, ``pmra``, ``pmdec``, ``ref_epoch``, ``phot_g_mean_mag``, perhaps ``bp_rp``.
     exposures : tuple of SimulatedExposure
-        The exposures.
-    distortion : Distortion
-        The distortion of the detector.
+        The exposures of each detector, field after field.
+    camera : SimulatedCamera
+        The camera.
     settings : dict
         The options it was made with.
     """
 
     reference: QTable
     exposures: tuple[SimulatedExposure, ...]
-    distortion: Distortion
+    camera: SimulatedCamera
     settings: dict
 
     def __post_init__(self):
         freeze_attributes(self, "settings")
 
+    @property
+    def distortion(self):
+        """The distortion of the first detector."""
+        return self.camera.detectors[0].distortion
+
+
+@dataclass(frozen=True, eq=False)
+class StarField:
+    """The stars of a field.
+
+    Parameters
+    ----------
+    stars : `~astropy.table.Table`
+        Columns ``ra``, ``dec``, ``pmra``, ``pmdec``, ``magnitude``, ``reference_index`` and perhaps
+        ``color``, at the epoch of the catalog.
+    vectors : (3, N) ndarray
+        Unit vectors towards them.
+    """
+
+    stars: object
+    vectors: np.ndarray
+
 
 def simulate(
     n_exposures=5,
     *,
+    camera="generic",
+    detectors=None,
     seed=1,
-    detector="sim",
-    image_shape=(2048, 2048),
-    pixel_scale=0.3 * u.arcsec,
     center=None,
     roll=0.0 * u.deg,
-    distortion=40.0,
-    waves=0.0,
-    density=20.0,
-    magnitudes=(15.0, 21.0),
+    density=None,
     slope=0.25,
     reference_limit=None,
-    cluster=0.0,
-    cluster_radius=45 * u.arcsec,
-    proper_motion=0.0 * u.mas / u.yr,
-    epoch=2016.0,
-    dither=30 * u.arcsec,
+    catalog_errors=None,
+    cluster=None,
+    galaxies=0.0,
+    colors=None,
+    proper_motion=None,
+    epoch=None,
+    dither=None,
     pointing_error=2 * u.arcsec,
     roll_error=0.01 * u.deg,
     scale_error=0.0,
-    spurious=0.1,
+    spurious=None,
     lost=0.05,
+    resolution=None,
     noise=True,
-    centroid_floor=0.005,
-    fwhm=2.5,
-    psf_variation=0.05,
-    gain=1.5,
-    read_noise=5.0,
-    background=200.0,
-    saturation=90000.0,
-    limit_snr=10.0,
-    exposure_time=100.0,
+    **camera_options,
 ):
-    """Simulate dithered exposures of one detector with a known distortion.
+    """Simulate dithered exposures of a camera whose distortion is known.
 
     Parameters
     ----------
     n_exposures : int, optional
-        Number of exposures.
+        Number of exposures of each field.
+    camera : str or SimulatedCamera, optional
+        One of the cameras that `make_camera` knows, "generic", "csst-msc" or "bass-90prime", or one
+        of your own.
+    detectors : sequence of str, optional
+        Names of the camera's detectors that are simulated; all by default.
     seed : int, optional
         The same seed gives the same simulation.
-    detector : str, optional
-        Name of the detector.
-    image_shape : (int, int), optional
-        Shape of the detector ``(ny, nx)``.
-    pixel_scale : `~astropy.units.Quantity`, optional
-        Angle of a pixel.
     center : `~astropy.coordinates.SkyCoord`, optional
-        Center of the field; RA 120 deg, Dec +30 deg by default.
+        Where the middle of the chosen detectors points, one position for each field; one field at
+        RA 120 deg, Dec +30 deg by default.
     roll : `~astropy.units.Quantity`, optional
-        Position angle of the detector's y axis, north through east.
-    distortion : float, optional
-        Greatest displacement by the smooth distortion, in px.
-    waves : float, optional
-        Scatter of the amplitudes of fine waves in the distortion, in px.
-    density : float, optional
-        Stars per square arcmin.
-    magnitudes : (float, float), optional
-        Magnitudes of the brightest and of the faintest star.
+        Position angle of the camera's y axis, north through east, of all exposures or of each of a
+        field.
+    density : float or sequence of float, optional
+        Stars per square arcmin down to the faintest magnitude, of all fields or of each.
     slope : float, optional
         Slope of the luminosity function, d log10 N / d mag.
     reference_limit : float, optional
         Faintest magnitude of the reference catalog; all stars by default.
-    cluster : float, optional
-        Share of the stars that are members of a star cluster at the center.
-    cluster_radius : `~astropy.units.Quantity`, optional
-        Core radius of the cluster.
+    catalog_errors : bool, optional
+        Whether the catalog has Gaia's errors; else its positions and motions are the truth, and
+        nothing is said of errors.
+    cluster : KingCluster, optional
+        A star cluster at the center of each field, besides the field's own stars.
+    galaxies : float, optional
+        Galaxies per square arcmin, which are in no catalog.
+    colors : (float, float), optional
+        Mean and scatter of the stars' colors; without them the catalog has none.
     proper_motion : `~astropy.units.Quantity`, optional
         Scatter of the proper motions per axis.
     epoch : float or (n_exposures,) array_like, optional
@@ -129,24 +148,14 @@ def simulate(
         Scatter of the true pixel scale about the header's, relative.
     spurious, lost : float, optional
         Spurious sources, and stars that are not detected, as shares of the stars on the detector.
+    resolution : float, optional
+        Of two sources closer than this, in FWHM, source lists have the brighter one alone.
     noise : bool, optional
         Scatter positions in the source lists and in the reference by their errors.
-    centroid_floor : float, optional
-        Centroid error of the brightest stars, in px.
-    fwhm : float, optional
-        Width of the PSF, in px.
-    psf_variation : float, optional
-        Relative change of the PSF's width and shape over the detector.
-    gain : float, optional
-        Electrons per count.
-    read_noise, background : float, optional
-        Read noise and background level, in electrons.
-    saturation : float, optional
-        Saturation level in electrons; saturated stars are missing from the source lists.
-    limit_snr : float, optional
-        Signal-to-noise ratio of the faintest star.  It sets the zero point.
-    exposure_time : float, optional
-        Exposure time in seconds, for the header.
+    **camera_options
+        Of a camera that is known by its name: ``image_shape``, ``distortion``, ``waves``,
+        ``pixel_scale``, ``magnitudes``, ``fwhm`` and all else that `make_camera` takes;
+        ``detector``: name of the only detector of the generic one.
 
     Returns
     -------
@@ -157,6 +166,14 @@ def simulate(
     ------
     ValueError
         If an option is out of range, or the distortion too large to be invertible.
+    TypeError
+        If an angle has no unit, or an option is unknown.
+
+    Notes
+    -----
+    What is not given (`None`) is usual for the camera: for "generic" 20 stars per square arcmin,
+    epoch 2016, a dither of 30 arcsec, no motions, 10 % of spurious sources, Gaia's errors, and
+    lists that tell all stars apart.
 
     Examples
     --------
@@ -169,277 +186,205 @@ def simulate(
     100.000000 200.000000
     >>> exposure.sources.colnames[:4]
     ['x', 'y', 'x_err', 'y_err']
+
+    Two of the 18 detectors of a mosaic, a tenth of their size, next to the south pole:
+
+    >>> from astropy.coordinates import SkyCoord
+    >>> pole = SkyCoord(10, -89.9, unit="deg")
+    >>> simulation = simulate(1, camera="csst-msc", detectors=["g-1", "y-4"], center=pole,
+    ...                       image_shape=(920, 920), distortion=20, density=100)
+    >>> [exposure.name for exposure in simulation.exposures]
+    ['csst-msc-01-g-1', 'csst-msc-01-y-4']
     """
-    settings = {k: v for k, v in locals().items() if k != "center"}
-    ny, nx = image_shape = tuple(int(n) for n in image_shape)
-    _require("n_exposures", n_exposures, n_exposures >= 1, "at least 1")
-    _require("image_shape", image_shape, min(image_shape) >= 16, "at least 16 px on each side")
-    _require("magnitudes", magnitudes, magnitudes[0] < magnitudes[1], "(brightest, faintest)")
-    _require("lost", lost, 0 <= lost <= 1, "between 0 and 1")
-    _require("cluster", cluster, 0 <= cluster <= 1, "between 0 and 1")
-    for name in ("distortion", "waves", "density", "spurious", "centroid_floor", "read_noise"):
-        _require(name, settings[name], settings[name] >= 0, "not negative")
-    for name in ("slope", "fwhm", "gain", "background", "saturation", "limit_snr"):
-        _require(name, settings[name], settings[name] > 0, "positive")
-    scale = _value("pixel_scale", pixel_scale, u.arcsec)
-    _require("pixel_scale", pixel_scale, scale > 0, "positive")
-    dither = _value("dither", dither, u.deg)
-    pointing_error = _value("pointing_error", pointing_error, u.deg)
-    roll, roll_error = _value("roll", roll, u.deg), _value("roll_error", roll_error, u.deg)
-    epochs = np.broadcast_to(np.asarray(epoch, float), (n_exposures,))
-    center = SkyCoord(120 * u.deg, 30 * u.deg) if center is None else center.icrs
-
-    camera = Camera(
-        image_shape=image_shape,
-        pixel_scale=scale,
-        fwhm=fwhm,
-        psf_variation=psf_variation,
-        gain=gain,
-        read_noise=read_noise,
-        background=background,
-        saturation=saturation,
-        zero_point=find_zero_point(magnitudes[1], limit_snr, fwhm, background, read_noise),
-        exposure_time=exposure_time,
-    )
+    settings = {k: v for k, v in locals().items() if k not in ("center", "camera")}
+    require("n_exposures", n_exposures, n_exposures >= 1, "at least 1")
+    require("seed", seed, isinstance(seed, (int, np.integer)) and seed >= 0, "0 or more")
     # One stream of numbers for each part: more exposures leave the first ones as they are.
-    streams = np.random.SeedSequence(seed).spawn(2 + n_exposures)
-    optics = Distortion.random(
-        image_shape, amplitude=distortion, waves=waves, rng=np.random.default_rng(streams[0])
+    streams = np.random.SeedSequence(int(seed)).spawn(2 + n_exposures)
+    usual = {**_USUAL, **USUAL.get(getattr(camera, "name", camera), {})}
+    given = {name: settings[name] for name in usual if settings[name] is not None}
+    usual |= given
+    camera = _the_camera(camera, detectors, streams[0], camera_options)
+    for name in ("spurious", "resolution", "galaxies"):
+        value = {**usual, "galaxies": galaxies}[name]
+        require(name, value, 0 <= value < np.inf, "not negative")
+    require("lost", lost, 0 <= lost <= 1, "between 0 and 1")
+    require("slope", slope, 0 < slope < np.inf, "positive")
+    if not (cluster is None or isinstance(cluster, KingCluster)):
+        raise TypeError(f"cluster must be a KingCluster or None, not {cluster!r}")
+    centers = _centers(center)
+    densities = _each("density", usual["density"], len(centers), "field")
+    require("density", usual["density"], (densities >= 0).all(), "not negative")
+    epochs = _each("epoch", usual["epoch"], n_exposures, "exposure")
+    rolls = _each("roll", value_of("roll", roll, u.deg), n_exposures, "exposure")
+    dither = float(value_of("dither", usual["dither"], u.deg))
+    require("dither", usual["dither"], dither >= 0, "not negative")
+    scatter = (
+        float(value_of("pointing_error", pointing_error, u.deg)),
+        float(value_of("roll_error", roll_error, u.deg)),
+        scale_error,
     )
-    rng = np.random.default_rng(streams[1])
-    reach = np.hypot(nx, ny) / 2 * scale / 3600 * 1.02 + dither + 4 * pointing_error
-    reach += (distortion + 20) * scale / 3600
-    sky = _make_field(
-        rng,
-        center,
-        reach,
-        density=density,
-        magnitudes=magnitudes,
+    drawing = {
+        "magnitudes": camera.magnitudes,
+        "slope": slope,
+        "cluster": cluster,
+        "proper_motion": float(value_of("proper_motion", usual["proper_motion"], u.mas / u.yr)),
+        "colors": colors,
+    }
+    measurement = Measurement(
+        spurious=usual["spurious"],
+        lost=lost,
+        noise=noise,
+        galaxies=galaxies,
         slope=slope,
-        cluster=cluster,
-        cluster_radius=_value("cluster_radius", cluster_radius, u.deg),
-        proper_motion=_value("proper_motion", proper_motion, u.mas / u.yr),
+        resolution=usual["resolution"],
     )
-    kept = sky["magnitude"] <= (np.inf if reference_limit is None else reference_limit)
-    sky["reference_index"] = np.where(kept, np.cumsum(kept) - 1, -1)
-    reference = _make_reference(rng, sky[kept], noise=noise)
 
-    exposures = []
-    for k in range(n_exposures):
-        stream, image_seed = streams[2 + k].spawn(2)
-        rng = np.random.default_rng(stream)
-        along = rng.uniform(-dither, dither, 2) if n_exposures > 1 else np.zeros(2)
-        pointing = _offset(center.ra.deg, center.dec.deg, *along)
-        true = _offset(*pointing, *(rng.normal(size=2) * pointing_error))
-        nominal_wcs = _linear_wcs(optics, scale, pointing, roll)
-        true_wcs = _linear_wcs(
-            optics,
-            scale * (1 + rng.normal() * scale_error),
-            true,
-            roll + rng.normal() * roll_error,
+    catalogs, exposures, n_before = [], [], 0
+    for number, where in enumerate(centers):
+        if number:
+            streams = np.random.SeedSequence([int(seed), number]).spawn(2 + n_exposures)
+        pointings = [
+            _point(camera, where, rolls[k], dither if n_exposures > 1 else 0.0, scatter, stream)
+            for k, stream in enumerate(streams[2:])
+        ]
+        rng = np.random.default_rng(streams[1])
+        extra = np.random.default_rng(streams[1].spawn(1)[0])
+        reach = _reach(camera, dither, scatter[0])
+        middle = _middle(camera)
+        away = max(np.hypot(*np.subtract(d.center, middle)) for d in camera.detectors)
+        stars = make_stars(
+            rng,
+            extra,
+            where,
+            reach + away * camera.arcsec / 3600,
+            density=densities[number],
+            **drawing,
         )
-        name = f"{detector}-{k + 1:02d}"
-        stars = _stars_on_detector(sky, epochs[k], optics, true_wcs)
-        exposures.append(
-            SimulatedExposure(
-                name=name,
-                detector=detector,
-                epoch=float(epochs[k]),
-                header=_make_header(nominal_wcs, camera, epochs[k], detector, name),
-                sources=_measure(
-                    rng,
-                    stars,
+        stars = stars[_near_detectors(stars, camera, pointings, reach + dither)]
+        in_catalog = stars["magnitude"] <= (np.inf if reference_limit is None else reference_limit)
+        index = n_before + np.cumsum(in_catalog) - 1
+        stars["reference_index"] = np.where(in_catalog, index, -1)
+        n_before += int(in_catalog.sum())
+        catalogs.append(
+            make_reference(rng, stars[in_catalog], noise=noise, errors=usual["catalog_errors"])
+        )
+        vectors, *_ = directions(stars["ra"].data, stars["dec"].data)
+        field = StarField(stars, vectors)
+        for k, (nominal, true, generator, image_seed) in enumerate(pointings):
+            label = f"{k + 1:02d}" if len(centers) == 1 else f"f{number + 1:02d}-{k + 1:02d}"
+            exposures += [
+                SimulatedExposure.of(
                     camera,
-                    spurious=spurious,
-                    lost=lost,
-                    noise=noise,
-                    floor=centroid_floor,
-                    slope=slope,
-                ),
-                stars=stars,
-                distortion=optics,
-                linear_wcs=true_wcs,
-                _camera=camera,
-                _seed=image_seed,
+                    d,
+                    label=label,
+                    epoch=float(epochs[k]),
+                    pointing=(nominal, true),
+                    field=field,
+                    measurement=measurement,
+                    streams=(generator.jumped(j), image_seed),
+                    place=j,
+                )
+                for j, d in enumerate(camera.detectors)
+            ]
+    reference = catalogs[0] if len(catalogs) == 1 else vstack(catalogs)
+    reference.add_column(
+        np.arange(len(reference), dtype=np.int64) + 4_000_000_000, name="source_id", index=0
+    )
+    return Simulation(reference, tuple(exposures), camera, settings)
+
+
+# Usual for any camera, unless its own entry says otherwise.
+_USUAL = {
+    "density": 20.0,
+    "epoch": CATALOG_EPOCH,
+    "proper_motion": 0.0 * u.mas / u.yr,
+    "dither": 30 * u.arcsec,
+    "spurious": 0.1,
+    "resolution": 0.0,
+    "catalog_errors": True,
+}
+
+
+def _the_camera(camera, detectors, seed, options):
+    if isinstance(camera, SimulatedCamera):
+        if options:
+            raise TypeError(
+                f"a camera of your own has its options already, not {', '.join(options)}: "
+                "dataclasses.replace makes another"
             )
+    else:
+        unknown = set(options) - _CAMERA_OPTIONS
+        if unknown:
+            raise TypeError(f"simulate has no option {', '.join(sorted(unknown))}")
+        options = {("name" if k == "detector" else k): v for k, v in options.items()}
+        camera = make_camera(camera, seed=seed, **options)
+    return camera if detectors is None else camera.only(detectors)
+
+
+_CAMERA_OPTIONS = {"detector", "image_shape", "distortion", "waves"} | (
+    set(signature(SimulatedCamera).parameters) - {"name", "detectors", "shared_tangent"}
+)
+
+
+def _centers(center):
+    """Right ascension and declination of each field, deg."""
+    if center is None:
+        return [(120.0, 30.0)]
+    if not isinstance(center, SkyCoord):
+        raise TypeError(f"center must be a SkyCoord, not {center!r}")
+    center = center.icrs.reshape(-1)
+    require("center", center, len(center) > 0, "at least one position")
+    return list(zip(center.ra.deg.tolist(), center.dec.deg.tolist(), strict=True))
+
+
+def _each(name, values, n, what):
+    values = np.asarray(values, float)
+    if values.shape not in ((), (1,), (n,)) or not np.isfinite(values).all():
+        raise ValueError(
+            f"{name} must be one number, or one for each {what} ({n}), not {values.tolist()}"
         )
-    return Simulation(reference, tuple(exposures), optics, settings)
+    return np.broadcast_to(values, (n,))
 
 
-def _require(name, value, good, rule):
-    if not good:
-        raise ValueError(f"{name} must be {rule}, not {value}")
+def _middle(camera):
+    """Middle of the detectors in the focal plane, px."""
+    places = np.array([d.center for d in camera.detectors])
+    return (places.min(axis=0) + places.max(axis=0)) / 2
 
 
-def _value(name, quantity, unit):
-    try:
-        return u.Quantity(quantity, subok=False).to_value(unit)
-    except u.UnitConversionError as error:
-        raise TypeError(f"{name} must be a Quantity in {unit}, not {quantity!r}") from error
+def _reach(camera, dither, pointing_error):
+    """How far from the nominal center of a detector there have to be stars, deg."""
+    size = max(np.hypot(*d.image_shape) for d in camera.detectors)
+    distortion = max(d.distortion.greatest() for d in camera.detectors)
+    reach = size / 2 * camera.arcsec / 3600 * 1.02 + dither + 4 * pointing_error
+    return reach + (distortion + 20) * camera.arcsec / 3600
 
 
-def _basis(ra, dec):
-    """Find the unit vectors towards a position, east and north of it; degrees in."""
-    ra, dec = np.deg2rad(ra), np.deg2rad(dec)
-    zero = np.zeros_like(ra)
-    return (
-        np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]),
-        np.array([-np.sin(ra), np.cos(ra), zero]),
-        np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)]),
-    )
+def _point(camera, center, roll, dither, scatter, stream):
+    """Draw where an exposure points, by its header and in truth, and what it is measured with."""
+    seed, image_seed = stream.spawn(2)
+    rng = np.random.default_rng(seed)
+    along = rng.uniform(-dither, dither, 2) if dither else np.zeros(2)
+    pointing_error, roll_error, scale_error = scatter
+    nominal = aim(*offset_positions(*center, *along), roll, camera.arcsec, _middle(camera))
+    off = rng.normal(size=2) * pointing_error
+    scale = camera.arcsec * (1 + rng.normal() * scale_error)
+    turned = roll + rng.normal() * roll_error
+    ra, dec = offset_positions(nominal.ra, nominal.dec, *off)
+    true = Pointing(float(ra), float(dec), float(turned), scale)
+    return nominal, true, rng.bit_generator, image_seed
 
 
-def _offset(ra, dec, east, north):
-    """Positions at tangent-plane offsets, all in degrees."""
-    p, e, n = _basis(np.asarray(ra, float), np.asarray(dec, float))
-    east, north = np.deg2rad(east), np.deg2rad(north)
-    shape = (3,) + (1,) * (np.ndim(east) - np.ndim(ra))
-    v = p.reshape(p.shape + shape[1:]) + e.reshape(e.shape + shape[1:]) * east
-    v = v + n.reshape(n.shape + shape[1:]) * north
-    return (
-        np.rad2deg(np.arctan2(v[1], v[0])) % 360,
-        np.rad2deg(np.arctan2(v[2], np.hypot(v[0], v[1]))),
-    )
-
-
-def _make_field(
-    rng, center, reach, *, density, magnitudes, slope, cluster, cluster_radius, proper_motion
-):
-    n = rng.poisson(density * (2 * reach * 60) ** 2)
-    east, north = rng.uniform(-reach, reach, (2, n))
-    members = int(round(cluster * n))
-    # Plummer's surface density, cut at 99 % of its mass.
-    q = rng.uniform(0, 0.99, members)
-    r, angle = cluster_radius * np.sqrt(q / (1 - q)), rng.uniform(0, 2 * np.pi, members)
-    east[:members], north[:members] = r * np.cos(angle), r * np.sin(angle)
-    bright, faint = 10 ** (slope * np.asarray(magnitudes, float))
-    ra, dec = _offset(center.ra.deg, center.dec.deg, east, north)
-    order = rng.permutation(n)
-    return Table(
-        {
-            "ra": ra[order],
-            "dec": dec[order],
-            "pmra": rng.normal(0, proper_motion, n),
-            "pmdec": rng.normal(0, proper_motion, n),
-            "magnitude": np.log10(rng.uniform(bright, faint, n)) / slope,
-        }
-    )
-
-
-def _make_reference(rng, sky, *, noise):
-    n = len(sky)
-    # Gaia's errors: flat for bright stars, then falling with the flux.
-    error = 0.02 * 10 ** (0.2 * np.clip(sky["magnitude"].data - 14.5, 0, None))
-    pm_error = 1.1 * error
-    shift = rng.normal(size=(4, n)) * [[noise]]
-    ra, dec = _offset(sky["ra"].data, sky["dec"].data, *(shift[:2] * error / 3.6e6))
-    return QTable(
-        {
-            "source_id": np.arange(n, dtype=np.int64) + 4_000_000_000,
-            "ra": ra * u.deg,
-            "dec": dec * u.deg,
-            "ra_error": error * u.mas,
-            "dec_error": error * u.mas,
-            "pmra": sky["pmra"].data * u.mas / u.yr,
-            "pmdec": sky["pmdec"].data * u.mas / u.yr,
-            "pmra_error": pm_error * u.mas / u.yr,
-            "pmdec_error": pm_error * u.mas / u.yr,
-            "ref_epoch": np.full(n, 2016.0) * u.yr,
-            "phot_g_mean_mag": sky["magnitude"].data * u.mag,
-        }
-    )
-
-
-def _linear_wcs(optics, scale, crval, roll):
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.cunit = ["deg", "deg"]
-    wcs.wcs.crpix = np.add(optics.center, 1)
-    wcs.wcs.crval = crval
-    c, s = np.cos(np.deg2rad(roll)), np.sin(np.deg2rad(roll))
-    wcs.wcs.cd = scale / 3600 * np.array([[-c, s], [s, c]])
-    wcs.wcs.radesys = "ICRS"
-    wcs.array_shape = optics.image_shape
-    wcs.wcs.set()
-    return wcs
-
-
-def _stars_on_detector(sky, epoch, optics, wcs):
-    years = epoch - 2016.0
-    p, e, n = _basis(sky["ra"].data, sky["dec"].data)
-    v = p + years * _MAS * (e * sky["pmra"].data + n * sky["pmdec"].data)
-    ra = np.rad2deg(np.arctan2(v[1], v[0])) % 360
-    dec = np.rad2deg(np.arctan2(v[2], np.hypot(v[0], v[1])))
-    x, y = optics.distort(*wcs.wcs_world2pix(ra, dec, 0))
-    ny, nx = optics.image_shape
-    margin = 20  # px: stars just off the detector shine onto it
-    with np.errstate(invalid="ignore"):
-        near = (x > -margin) & (x < nx - 1 + margin) & (y > -margin) & (y < ny - 1 + margin)
-    return Table(
-        {
-            "x": x[near],
-            "y": y[near],
-            "ra": ra[near],
-            "dec": dec[near],
-            "magnitude": sky["magnitude"].data[near],
-            "reference_index": sky["reference_index"].data[near],
-        }
-    )
-
-
-def _measure(rng, stars, camera, *, spurious, lost, noise, floor, slope):
-    ny, nx = camera.image_shape
-    x, y, magnitude = stars["x"].data, stars["y"].data, stars["magnitude"].data
-    seen = on_detector(x, y, (ny, nx))
-    seen &= rng.uniform(size=len(stars)) >= lost
-    seen &= camera.peak(camera.flux(magnitude)) < camera.saturation
-    x, y, magnitude = x[seen], y[seen], magnitude[seen]
-    index = stars["reference_index"].data[seen]
-    n = len(x)
-    m = rng.poisson(spurious * n)
-    faint = magnitude.max(initial=0.0)
-    flux = camera.flux(np.append(magnitude, faint - rng.exponential(1 / (slope * 3), m)))
-    snr = camera.snr(flux)
-    # The photon limit of a Gaussian image, and what no image gets under.
-    sigma = np.hypot(floor, camera.fwhm * SIGMA_PER_FWHM / snr)
-    error = rng.normal(size=(2, n + m)) * sigma * noise
-    error[:, n:] = 0.0
-    order = rng.permutation(n + m)
-    return Table(
-        {
-            "x": (np.append(x, rng.uniform(-0.5, nx - 0.5, m)) + error[0])[order],
-            "y": (np.append(y, rng.uniform(-0.5, ny - 0.5, m)) + error[1])[order],
-            "x_err": sigma[order],
-            "y_err": sigma[order],
-            "flux": flux[order] / camera.gain,
-            "snr": snr[order],
-            "roundness": rng.normal(0, np.append(np.full(n, 0.05), np.full(m, 0.12)))[order],
-            "reference_index": np.append(index, np.full(m, -1))[order],
-        }
-    )
-
-
-def _make_header(wcs, camera, epoch, detector, name):
-    header = fits.Header()
-    header["NAXIS"] = 2
-    header["NAXIS1"], header["NAXIS2"] = camera.image_shape[1], camera.image_shape[0]
-    header["OBJECT"] = name
-    header["DETECTOR"] = detector
-    header["FILTER"] = "g"
-    header["EXPTIME"] = (camera.exposure_time, "[s]")
-    start = Time(epoch, format="jyear", scale="utc") - camera.exposure_time / 2 * u.s
-    header["DATE-OBS"] = (start.isot, "start of the exposure, UTC")
-    header["MJD-OBS"] = (start.mjd, "[d] start of the exposure")
-    header["GAIN"] = (camera.gain, "[e-/count]")
-    header["RDNOISE"] = (camera.read_noise, "[e-]")
-    # A little lower than where pixels end, as cameras give it.
-    header["SATURATE"] = (round(0.95 * camera.saturation / camera.gain, 3), "[count]")
-    header["RADESYS"] = "ICRS"
-    for i in (0, 1):
-        header[f"CTYPE{i + 1}"] = wcs.wcs.ctype[i]
-        header[f"CUNIT{i + 1}"] = "deg"
-        header[f"CRPIX{i + 1}"] = wcs.wcs.crpix[i]
-        header[f"CRVAL{i + 1}"] = wcs.wcs.crval[i]
-        for j in (0, 1):
-            header[f"CD{i + 1}_{j + 1}"] = wcs.wcs.cd[i, j]
-    return header
+def _near_detectors(stars, camera, pointings, reach):
+    """Mark the stars that some exposure has on a detector or near it."""
+    if len(camera.detectors) == 1:
+        return slice(None)
+    centers = []
+    for nominal, *_ in pointings:
+        for d in camera.detectors:
+            wcs = nominal.linear_wcs(d, d.center, shared_tangent=camera.shared_tangent)
+            centers.append(wcs.wcs_pix2world([d.distortion.center], 0)[0])
+    tree = cKDTree(directions(*np.transpose(centers))[0].T)
+    vectors, *_ = directions(stars["ra"].data, stars["dec"].data)
+    return np.isfinite(tree.query(vectors.T, distance_upper_bound=np.deg2rad(reach))[0])

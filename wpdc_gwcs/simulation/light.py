@@ -1,8 +1,8 @@
-"""The camera of a simulation: its noise, its PSF, and light on its pixels."""
-
-from dataclasses import dataclass
+"""Light on the pixels of a simulation: its PSF, and Gaussians drawn into images."""
 
 import numpy as np
+
+__all__ = ["DISC", "PSF", "SIGMA_PER_FWHM", "add_gaussians", "find_zero_point"]
 
 SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 # Core and wings of the PSF, as (share of the flux, width in units of the core's): about a Moffat
@@ -12,44 +12,23 @@ PSF = ((0.82, 1.0), (0.18, 2.1))
 DISC = ((0.18, 0.28), (0.47, 0.72), (0.35, 1.45))
 
 
-@dataclass(frozen=True)
-class Camera:
-    """What the light falls on."""
-
-    image_shape: tuple[int, int]
-    pixel_scale: float  # arcsec
-    fwhm: float  # px
-    psf_variation: float
-    gain: float  # e- per count
-    read_noise: float  # e-
-    background: float  # e-
-    saturation: float  # e-
-    zero_point: float  # magnitude of one electron
-    exposure_time: float  # s
-
-    def flux(self, magnitude):
-        return 10 ** (-0.4 * (np.asarray(magnitude) - self.zero_point))
-
-    def widths(self, x, y):
-        """Gaussian width of the PSF's core along x and y, in px, at detector positions."""
-        ny, nx = self.image_shape
-        a, b = 2 * np.asarray(x) / nx - 1, 2 * np.asarray(y) / ny - 1
-        s = self.fwhm * SIGMA_PER_FWHM * (1 + self.psf_variation * (a * a + b * b) / 2)
-        shape = self.psf_variation * (a - b) / 2
-        return s * (1 + shape), s * (1 - shape)
-
-    def snr(self, flux):
-        """Signal-to-noise ratio of a star under the PSF's noise-equivalent area."""
-        area = 4 * np.pi * (self.fwhm * SIGMA_PER_FWHM) ** 2
-        return flux / np.sqrt(flux + area * (self.background + self.read_noise**2))
-
-    def peak(self, flux):
-        """Electrons in the brightest pixel of a star, about."""
-        return flux * 0.85 / max(2 * np.pi * (self.fwhm * SIGMA_PER_FWHM) ** 2, 1.0)
-
-
 def find_zero_point(magnitude, snr, fwhm, background, read_noise):
-    """Magnitude of one electron at which a star of this magnitude has this S/N."""
+    """Find the magnitude of one electron at which a star of this magnitude has this S/N.
+
+    Parameters
+    ----------
+    magnitude, snr : float
+        Magnitude of a star and its signal-to-noise ratio.
+    fwhm : float
+        Width of the PSF, px.
+    background, read_noise : float
+        Level of the background and read noise, electrons.
+
+    Returns
+    -------
+    float
+        The magnitude.
+    """
     area = 4 * np.pi * (fwhm * SIGMA_PER_FWHM) ** 2
     flux = (snr**2 + np.sqrt(snr**4 + 4 * snr**2 * area * (background + read_noise**2))) / 2
     return magnitude + 2.5 * np.log10(flux)
@@ -58,6 +37,19 @@ def find_zero_point(magnitude, snr, fwhm, background, read_noise):
 def add_gaussians(image, x, y, flux, sx, sy):
     """Add Gaussians, integrated over the pixels, to an image, in place.
 
+    Parameters
+    ----------
+    image : (ny, nx) ndarray
+        The image, which is changed.
+    x, y : (N,) ndarray
+        Their centers, px, zero based.
+    flux : (N,) ndarray
+        Electrons in each.
+    sx, sy : (N,) ndarray
+        Their widths along the axes, px.
+
+    Notes
+    -----
     Stamps are as large as it takes to leave less than 0.02 electrons per pixel outside; stars of
     one stamp size are drawn together.
     """

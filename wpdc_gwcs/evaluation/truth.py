@@ -1,0 +1,288 @@
+"""Calibrations held against the truth of a simulation.
+
+::
+
+    Calibration, FrameTruth --grid over the detector, matched stars--> error of the WCS
+    matches, stars of the truth --> wrong pairs, pulls
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import QTable
+
+from wpdc_gwcs.evaluation.cuts import Cuts
+
+__all__ = ["TruthScore", "pool_scores", "score_frame", "tabulate_scores"]
+
+_ALL = "all"
+# A pair is wrong if its star is not the one that the list's source is.  Of an image there is no
+# such list: wrong is what is further from its star than centroids are off, in errors and px.
+_FAR_SIGMA, _FAR_PX = 5.0, 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class TruthScore:
+    """How far a calibration is from the truth.
+
+    Parameters
+    ----------
+    frame : str
+        Name of the frame; "all" for pooled ones.
+    detector : str
+        Name of the detector; "all" for a whole run.
+    n_frames : int
+        Number of frames.
+    wcs_rms : float
+        Root mean square of the length of the WCS's error over the detector, px.
+    wcs_mean_dx, wcs_mean_dy : float
+        Its mean along both axes, px.
+    wcs_p95, wcs_max : float
+        Its 95th percentile and its greatest length, px.
+    wcs_rms_static : float
+        Root mean square of what all frames of the detector have in common, px.
+    wcs_rms_stars : float
+        Root mean square where the stars of the fit are, px.
+    share_below : float
+        Share of the area where the error is shorter than the limit.
+    limit : float
+        The limit, px.
+    n_matched, n_wrong : int
+        Number of pairs, and of wrong ones among them.
+    n_used, n_wrong_used : int
+        The same of those in the fit.
+    pull_wcs : float
+        Error of the WCS over its stated uncertainty, root mean square per axis; 1 if it is right.
+    pull_stars : float
+        Error of the measured positions over their stated one, of the right pairs in the fit.
+    error_x, error_y : (n, n) ndarray
+        Error of the WCS on the grid over the detector, px; NaN outside the cuts.
+    """
+
+    frame: str
+    detector: str
+    n_frames: int
+    wcs_rms: float
+    wcs_mean_dx: float
+    wcs_mean_dy: float
+    wcs_p95: float
+    wcs_max: float
+    wcs_rms_static: float
+    wcs_rms_stars: float
+    share_below: float
+    limit: float
+    n_matched: int
+    n_wrong: int
+    n_used: int
+    n_wrong_used: int
+    pull_wcs: float
+    pull_stars: float
+    error_x: np.ndarray
+    error_y: np.ndarray
+
+
+def score_frame(calibration, truth, stars, *, cuts=None, limit=0.01, n_grid=101):
+    """Score a calibrated frame.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibrated frame, with its ``matches``.
+    truth : FrameTruth
+        The truth about it.
+    stars : `~astropy.table.Table`
+        The truth star by star, see `wpdc_gwcs.simulation.read_truth`: columns ``x``, ``y``,
+        ``catalog_index`` and, of a source list, ``source_index``.
+    cuts : Cuts, optional
+        Limits on the area, and on the stars.
+    limit : float, optional
+        Length of an error, px, below which a part of the area is counted.
+    n_grid : int, optional
+        Points of the grid along each axis, from edge to edge of the detector.
+
+    Returns
+    -------
+    TruthScore
+        The score.
+
+    Raises
+    ------
+    ValueError
+        If the calibration has no matches, or is of another detector.
+    """
+    m, solution = calibration.matches, calibration.solution
+    if m is None:
+        raise ValueError("score_frame needs a calibrated frame with its matches")
+    if tuple(solution.image_shape) != tuple(truth.image_shape):
+        raise ValueError(
+            f"frame {calibration.frame} must be of shape {truth.image_shape} as its truth, is of "
+            f"{tuple(solution.image_shape)}"
+        )
+    cuts = Cuts() if cuts is None else cuts
+    x, y, dx, dy = truth.wcs_error(calibration.wcs, n_grid=n_grid)
+    inside = cuts.place(x, y, solution.crpix)
+    error = np.where(inside, [dx, dy], np.nan)
+    sigma_x, sigma_y, rho = calibration.uncertainty(x, y)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        a, b = error[0] / sigma_x, error[1] / sigma_y
+        squared = (a * a - 2 * rho * a * b + b * b) / (1 - rho * rho) / 2
+
+    chosen = cuts.select(m, solution.crpix)
+    used = np.asarray(m["used"], bool) & chosen
+    star, wrong = _true_stars(m, stars)
+    at = [np.asarray(m[name], float)[used] for name in ("x", "y")]
+    at_stars = truth.error_at(calibration.wcs, *at)
+    right = used & ~wrong
+    pulls = [
+        (np.asarray(m[name], float)[right] - np.asarray(stars[name], float)[star[right]])
+        / np.asarray(m[f"{name}_err"], float)[right]
+        for name in ("x", "y")
+    ]
+    return TruthScore(
+        calibration.frame,
+        solution.detector,
+        1,
+        **_moments(error, limit),
+        wcs_rms_static=np.nan,
+        wcs_rms_stars=_rms(np.hypot(*at_stars)),
+        limit=limit,
+        n_matched=int(chosen.sum()),
+        n_wrong=int((wrong & chosen).sum()),
+        n_used=int(used.sum()),
+        n_wrong_used=int((wrong & used).sum()),
+        pull_wcs=_rms(np.sqrt(squared)),
+        pull_stars=_rms(pulls),
+        error_x=error[0].reshape(n_grid, n_grid),
+        error_y=error[1].reshape(n_grid, n_grid),
+    )
+
+
+def _true_stars(matches, stars):
+    """Row of each pair's star in the truth, -1 where it has none, and whether the pair is wrong."""
+    catalog = np.asarray(matches["catalog_index"], int)
+    row_of = _rows(stars["catalog_index"], catalog.max(initial=0) + 1)
+    star = row_of[catalog]
+    if "source_index" in stars.colnames:
+        source = np.asarray(matches["source_index"], int)
+        true = _rows(stars["source_index"], source.max(initial=0) + 1)[source]
+        return star, (star < 0) | (true != star)
+    off = np.hypot(
+        *(np.asarray(matches[k], float) - np.asarray(stars[k], float)[star] for k in ("x", "y"))
+    )
+    error = np.hypot(*(np.asarray(matches[f"{k}_err"], float) for k in ("x", "y")))
+    return star, (star < 0) | (off > np.maximum(_FAR_SIGMA * error, _FAR_PX))
+
+
+def _rows(index, size):
+    """Row of the truth for each index of a list or catalog, -1 where there is none."""
+    index = np.asarray(index, int)
+    known = np.flatnonzero((index >= 0) & (index < size))
+    rows = np.full(size, -1)
+    rows[index[known]] = known
+    return rows
+
+
+def _rms(values):
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
+
+
+def _moments(error, limit):
+    length = np.hypot(*error)
+    inside = np.isfinite(length)
+    if not inside.any():
+        return dict.fromkeys(
+            ("wcs_rms", "wcs_mean_dx", "wcs_mean_dy", "wcs_p95", "wcs_max", "share_below"), np.nan
+        )
+    length = length[inside]
+    return {
+        "wcs_rms": _rms(length),
+        "wcs_mean_dx": float(error[0][inside].mean()),
+        "wcs_mean_dy": float(error[1][inside].mean()),
+        "wcs_p95": float(np.percentile(length, 95)),
+        "wcs_max": float(length.max()),
+        "share_below": float(np.mean(length < limit)),
+    }
+
+
+def pool_scores(scores):
+    """Pool the scores of frames, detector by detector, and of all of them.
+
+    Parameters
+    ----------
+    scores : sequence of TruthScore
+        Scores of frames, with one limit.
+
+    Returns
+    -------
+    list of TruthScore
+        One for each detector, in the order of their names; last, where there are several, one of
+        all.  The errors on the grid are the means over the frames.
+
+    Raises
+    ------
+    ValueError
+        If there are no scores.
+    """
+    if not isinstance(scores, Sequence) or not scores:
+        raise ValueError("pool_scores needs the scores of frames")
+    groups = {}
+    for score in scores:
+        groups.setdefault(score.detector, []).append(score)
+    found = [_pool(group, detector) for detector, group in sorted(groups.items())]
+    if len(found) > 1:
+        static = _rms([s.wcs_rms_static for s in found])
+        found.append(_pool(list(scores), _ALL, static))
+    return found
+
+
+def _pool(group, detector, static=None):
+    errors = np.array([[s.error_x.ravel(), s.error_y.ravel()] for s in group]).transpose(1, 0, 2)
+    mean = errors.mean(axis=1)
+    number = np.array([s.n_used for s in group], float)
+
+    def over_stars(name):
+        values = np.array([getattr(s, name) for s in group])
+        known = np.isfinite(values) & (number > 0)
+        if not known.any():
+            return np.nan
+        return float(np.sqrt(np.average(values[known] ** 2, weights=number[known])))
+
+    side = group[0].error_x.shape
+    return TruthScore(
+        _ALL,
+        detector,
+        len(group),
+        **_moments(errors.reshape(2, -1), group[0].limit),
+        wcs_rms_static=_rms(np.hypot(*mean)) if static is None else static,
+        wcs_rms_stars=over_stars("wcs_rms_stars"),
+        limit=group[0].limit,
+        **{
+            name: sum(getattr(s, name) for s in group)
+            for name in ("n_matched", "n_wrong", "n_used", "n_wrong_used")
+        },
+        pull_wcs=_rms([s.pull_wcs for s in group]),
+        pull_stars=over_stars("pull_stars"),
+        error_x=mean[0].reshape(side),
+        error_y=mean[1].reshape(side),
+    )
+
+
+def tabulate_scores(scores):
+    """Put scores into a table.
+
+    Parameters
+    ----------
+    scores : sequence of TruthScore
+        Of frames, or pooled.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        One row each: all fields of `TruthScore` but the errors on the grid.
+    """
+    return QTable(
+        [{k: v for k, v in vars(s).items() if k not in ("error_x", "error_y")} for s in scores]
+    )

@@ -1,0 +1,217 @@
+"""Simulations in files: frames and catalog as the command line reads them, and the truth.
+
+::
+
+    NAME.ldac | NAME.cat.ecsv + NAME.hdr | NAME.fits     what was measured
+    CAMERA-reference.fits                                the reference catalog
+    truth.asdf, NAME.truth.ecsv                          the truth: an exact WCS, star by star
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import Table
+
+from wpdc_gwcs.exceptions import InputError
+from wpdc_gwcs.io.files import OutputExistsError, atomic_path
+from wpdc_gwcs.io.tables import read_table, write_table
+from wpdc_gwcs.io.truth import read_truths, write_truths
+
+__all__ = ["Truth", "read_truth", "write_simulation"]
+
+TRUTH = "truth.asdf"
+_UNITS = {"x": u.pix, "y": u.pix, "ra": u.deg, "dec": u.deg, "magnitude": u.mag, "color": u.mag}
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The truth about the frames of a simulation, from its folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the simulation.
+    camera : str
+        Name of the camera.
+    catalog : Path
+        The reference catalog.
+    frames : dict
+        Name of a frame to `~wpdc_gwcs.simulation.FrameTruth`.
+    files : dict
+        Name of a frame to the path that `wpdc calibrate` reads.
+    """
+
+    folder: Path
+    camera: str
+    catalog: Path
+    frames: dict
+    files: dict
+
+    def stars(self, name):
+        """Read the truth about a frame star by star.
+
+        Parameters
+        ----------
+        name : str
+            Name of the frame.
+
+        Returns
+        -------
+        `~astropy.table.Table`
+            Stars on the detector: ``x``, ``y`` in px, ``ra``, ``dec`` in deg at the epoch of the
+            frame, ``magnitude``, perhaps ``color``, ``catalog_index`` (0-based row of the
+            reference, -1 where it has not the star) and, of source lists, ``source_index``
+            (0-based row of the list, -1 where the star was not detected).
+        """
+        return read_table(
+            self.folder / f"{name}.truth.ecsv",
+            columns=("x", "y", "ra", "dec", "magnitude", "catalog_index"),
+        )
+
+
+def read_truth(folder):
+    """Read the truth about a simulation.
+
+    Parameters
+    ----------
+    folder : path-like
+        Folder that `write_simulation` wrote.
+
+    Returns
+    -------
+    Truth
+        The truth; tables of stars are read when they are asked for.
+
+    Raises
+    ------
+    FileFormatError
+        If the truth is missing or damaged.
+    """
+    folder = Path(folder)
+    tree, frames = read_truths(folder / TRUTH)
+    files = {name: folder / node["file"] for name, node in tree["frames"].items()}
+    return Truth(folder, tree["camera"], folder / tree["catalog"], frames, files)
+
+
+def write_simulation(
+    simulation,
+    directory,
+    *,
+    images=(0,),
+    sources="ecsv",
+    overwrite=False,
+    progress=None,
+    **render_options,
+):
+    """Write a simulation to files, as `wpdc calibrate` reads them, with the truth about it.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        The simulation.
+    directory : path-like
+        Folder to write to; made where it is missing.
+    images : sequence of int, optional
+        Exposures (counted from 0) that are written as rendered images; the others as source lists.
+    sources : {"ecsv", "ldac"}, optional
+        Form of the source lists: a table beside a text header, or FITS_LDAC.
+    overwrite : bool, optional
+        Replace files that are already there.
+    progress : callable, optional
+        Called as ``progress("write", done, total)`` after each frame.
+    **render_options
+        Passed to `~wpdc_gwcs.simulation.SimulatedExposure.render`.
+
+    Returns
+    -------
+    dict
+        ``"reference"``: path of the catalog; ``"frames"``: list with one path per exposure, image
+        or source list; ``"headers"``: list of paths of the text headers, `None` where the frame has
+        its own; ``"truth"``: path of the exact WCSs, beside tables of the stars of each frame.
+
+    Raises
+    ------
+    ValueError
+        If the form of the source lists is unknown.
+    FileExistsError
+        If a file is there already and ``overwrite`` is not set.
+    InputError
+        If the folder cannot be written to.
+    """
+    if sources not in ("ecsv", "ldac"):
+        raise ValueError(f"sources must be 'ecsv' or 'ldac', not {sources!r}")
+    directory = Path(directory)
+    suffix = {"ecsv": ".cat.ecsv", "ldac": ".ldac"}[sources]
+    catalog, truth = directory / f"{simulation.camera.name}-reference.fits", directory / TRUTH
+    frames, headers, tables = [], [], []
+    for k, exposure in enumerate(simulation.exposures):
+        is_image = k in images
+        frames.append(directory / (exposure.name + (".fits" if is_image else suffix)))
+        has_own = is_image or sources == "ldac"
+        headers.append(None if has_own else directory / f"{exposure.name}.hdr")
+        tables.append(directory / f"{exposure.name}.truth.ecsv")
+    for path in [catalog, truth, *frames, *tables, *(h for h in headers if h is not None)]:
+        if path.exists() and not overwrite:
+            raise OutputExistsError(f"{path} exists; overwrite is not set")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as problem:
+        raise InputError(f"{directory}: cannot be made: {problem.strerror}") from problem
+    with atomic_path(catalog, overwrite=overwrite) as temporary:
+        simulation.reference.write(temporary, format="fits")
+    for k, exposure in enumerate(simulation.exposures):
+        listed, stars = exposure.observe()
+        if k in images:
+            image = exposure.render(**render_options)
+            with atomic_path(frames[k], overwrite=overwrite) as temporary:
+                fits.writeto(temporary, image, exposure.header)
+            stars.remove_column("source_index")
+        elif sources == "ecsv":
+            write_table(listed, frames[k], overwrite=overwrite)
+            with atomic_path(headers[k], overwrite=overwrite) as temporary:
+                exposure.header.totextfile(temporary)
+        else:
+            with atomic_path(frames[k], overwrite=overwrite) as temporary:
+                _write_ldac(listed, exposure.header, temporary)
+        stars.rename_column("reference_index", "catalog_index")
+        for name in stars.colnames:
+            stars[name].unit = _UNITS.get(name)
+        write_table(stars, tables[k], overwrite=overwrite)
+        if progress is not None:
+            progress("write", k + 1, len(frames))
+    write_truths(
+        simulation.exposures,
+        truth,
+        camera=simulation.camera.name,
+        catalog=catalog.name,
+        files=[(p.name, "image" if k in images else "list") for k, p in enumerate(frames)],
+        overwrite=overwrite,
+    )
+    return {"reference": catalog, "frames": frames, "headers": headers, "truth": truth}
+
+
+def _write_ldac(s, header, path):
+    cards = [str(card).ljust(80).encode("ascii") for card in header.cards]
+    cards.append(b"END".ljust(80))
+    # Padded with blanks: readers in C take a NUL for the end of the header.
+    text = np.frombuffer(b"".join(cards), np.uint8).reshape(1, len(cards), 80)
+    imhead = fits.BinTableHDU.from_columns(
+        [fits.Column("Field Header Card", f"{text.size}B", dim=f"(80, {len(cards)})", array=text)],
+        name="LDAC_IMHEAD",
+    )
+    imhead.header["TFORM1"] = f"{text.size}A"
+    columns = {
+        "XWIN_IMAGE": s["x"] + 1,  # FITS_LDAC counts pixels from 1
+        "YWIN_IMAGE": s["y"] + 1,
+        "ERRAWIN_IMAGE": s["x_err"],
+        "ERRBWIN_IMAGE": s["y_err"],
+        "ERRTHETAWIN_IMAGE": np.zeros(len(s)),
+        "FLUX_AUTO": s["flux"],
+        "FLUXERR_AUTO": s["flux"] / s["snr"],
+        "FLAGS": np.zeros(len(s), np.int16),
+    }
+    objects = fits.BinTableHDU(Table(columns), name="LDAC_OBJECTS")
+    fits.HDUList([fits.PrimaryHDU(), imhead, objects]).writeto(path)

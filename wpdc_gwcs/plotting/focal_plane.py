@@ -1,0 +1,158 @@
+"""The distortion of all detectors of a camera where they stand in the focal plane."""
+
+import numpy as np
+
+from wpdc_gwcs.models import deproject, project
+from wpdc_gwcs.plotting._style import BLUE, GREY, ORANGE, given_axes, round_number
+
+__all__ = ["plot_focal_plane"]
+
+# Length of the longest arrow in units of the distance of the arrows, if no magnification is given.
+_LONGEST = 2.5
+
+
+def plot_focal_plane(detectors, *, axes=None, n_arrows=8, magnification=None):
+    """Draw the distortion of all detectors of a camera as arrows, where the detectors stand.
+
+    Parameters
+    ----------
+    detectors : Camera or iterable of Calibration
+        The camera, or one calibrated frame of each detector, all of one exposure or of pointings
+        that are told by nothing but the detectors' places.
+    axes : `matplotlib.axes.Axes`, optional
+        Where it goes; new ones if not given.
+    n_arrows : int, optional
+        Arrows along each side of a detector.
+    magnification : float, optional
+        Length of the arrows over the distortion; the paper's is 10.  A round number by which they
+        do not cross, if not given.
+
+    Returns
+    -------
+    `matplotlib.axes.Axes`
+        With a box and a name for each detector, in thousands of px of the focal plane.
+
+    Raises
+    ------
+    ValueError
+        If there is no detector, or one is there twice.
+
+    Notes
+    -----
+    An arrow begins where the pixel would be without distortion, in the linear part of the solution
+    about its reference point, and shows to where the whole solution puts it.
+
+    References
+    ----------
+    WPDC-2P, arXiv:2603.09193, figure 1.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import calibrate, simulate
+    >>> from wpdc_gwcs.plotting import plot_focal_plane
+    >>> sky = simulate(1, image_shape=(1000, 1000), density=30, distortion=10, seed=2)
+    >>> run = calibrate([e.frame() for e in sky.exposures], sky.reference)
+    >>> axes = plot_focal_plane(run.calibrations)
+    >>> [text.get_text() for text in axes.texts][0]
+    'sim'
+    """
+    if not n_arrows >= 1:
+        raise ValueError(f"n_arrows must be at least 1, got {n_arrows}")
+    places = _of_camera(detectors) if hasattr(detectors, "places") else _of_frames(detectors)
+    edges = [to_plane(*_outline(s.image_shape)) for _, s, to_plane in places]
+    if axes is None:
+        width, height = np.ptp(np.concatenate(edges, axis=1), axis=1)
+        axes = given_axes(None, 1, 8.0, float(np.clip(7.2 * height / width, 2.5, 11.0)) + 0.8)[0]
+    starts, steps, spacing = [], [], []
+    for (name, solution, to_plane), edge in zip(places, edges, strict=True):
+        ny, nx = solution.image_shape
+        axes.plot(*edge / 1e3, color=GREY, lw=0.9)
+        middle = to_plane(np.array([0.5 * (nx - 1)]), np.array([0.5 * (ny - 1)]))[:, 0]
+        axes.text(
+            *middle / 1e3, name, color=BLUE, ha="center", va="center", weight="bold", zorder=4,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1},
+        )  # fmt: skip
+        x, y = (
+            a.ravel()
+            for a in np.meshgrid(
+                *((np.arange(n_arrows) + 0.5) * n / n_arrows - 0.5 for n in (nx, ny))
+            )
+        )
+        start = to_plane(x, y)
+        starts.append(start)
+        steps.append(to_plane(*np.array(solution.undistort(x, y))) - start)
+        spacing.append(np.hypot(*(edge[:, 1] - edge[:, 0])) / n_arrows)
+    start, step = np.concatenate(starts, axis=1), np.concatenate(steps, axis=1)
+    longest = float(np.hypot(*step).max())
+    if magnification is None:
+        magnification = round_number(_LONGEST * min(spacing) / longest) if longest > 0 else 1.0
+    quiver = axes.quiver(
+        *start / 1e3, *step / 1e3, angles="xy", scale_units="xy", scale=1 / magnification,
+        width=0.0022, color=ORANGE, zorder=3,
+    )  # fmt: skip
+    key = round_number(longest / 2) if longest > 0 else 1.0
+    axes.quiverkey(
+        quiver, 0.86, 1.04, key / 1e3, f"{key:g} px", labelpos="E", color=ORANGE,
+        coordinates="axes",
+    )  # fmt: skip
+    axes.set_aspect("equal")
+    axes.set_xlabel("focal plane x [1000 px]")
+    axes.set_ylabel("focal plane y [1000 px]")
+    axes.set_title(rf"distortion $\times$ {magnification:g}, at most {longest:.3g} px", loc="left")
+    return axes
+
+
+def _outline(image_shape):
+    """Corners of the outer pixel edges of a detector, the first one twice."""
+    ny, nx = image_shape
+    return np.array([[0, nx, nx, 0, 0], [0, 0, ny, ny, 0]]) - 0.5
+
+
+def _of_camera(camera):
+    """Name, solution and map from undistorted px to the focal plane of each detector."""
+    found = []
+    for k, name in enumerate(camera.detectors):
+        solution = camera.solutions[name]
+
+        def to_plane(x, y, k=k, solution=solution):
+            offset = np.array([x - solution.crpix[0], y - solution.crpix[1]])
+            return camera.matrices[k] @ offset + camera.places[k][:, None]
+
+        found.append((name, solution, to_plane))
+    return found
+
+
+def _of_frames(calibrations):
+    """Give the same of frames, in the plane of the first one about the middle of all."""
+    calibrations = list(calibrations)
+    if not calibrations:
+        raise ValueError("a focal plane needs one detector at least")
+    names = [c.solution.detector for c in calibrations]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise ValueError(f"every detector must be there once, {min(twice)!r} is there twice")
+    directions = np.radians([c.crval for c in calibrations])
+    ra, dec = directions.T
+    x, y, z = np.mean([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+    middle = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+    first = np.asarray(calibrations[0].cd, float)
+
+    found = []
+    for c in calibrations:
+
+        def to_plane(x, y, c=c):
+            crpix = c.solution.crpix
+            offset = np.array([x - crpix[0], y - crpix[1]])
+            sky = deproject(*(np.asarray(c.cd) @ offset), c.crval)
+            return np.linalg.solve(first, np.array(project(*sky, middle)))
+
+        found.append((c.solution.detector, _OwnDistortion(c), to_plane))
+    return found
+
+
+class _OwnDistortion:
+    """Distortion of a frame with its field, as the solution of a detector has it."""
+
+    def __init__(self, calibration):
+        self.image_shape = calibration.solution.image_shape
+        self.undistort = calibration.undistort

@@ -1,0 +1,85 @@
+"""The paper, reproduced: its tables and figures, made of public functions alone."""
+
+from pathlib import Path
+
+from astropy.table import vstack
+
+from wpdc_gwcs.exceptions import InputError
+from wpdc_gwcs.io import write_table
+from wpdc_gwcs.reproduction.bass import reproduce_bass
+from wpdc_gwcs.reproduction.claims import CLAIMS, Claim
+from wpdc_gwcs.reproduction.detectors import reproduce_detectors
+from wpdc_gwcs.reproduction.results import tabulate_results
+from wpdc_gwcs.reproduction.scale import FULL, QUICK, Scale
+from wpdc_gwcs.reproduction.weights import reproduce_weights
+
+__all__ = [
+    "CLAIMS",
+    "FULL",
+    "PARTS",
+    "QUICK",
+    "Claim",
+    "Scale",
+    "reproduce",
+    "reproduce_bass",
+    "reproduce_detectors",
+    "reproduce_weights",
+    "tabulate_results",
+]
+
+#: Name of a part to the function that makes it.
+PARTS = {
+    "detectors": reproduce_detectors,
+    "bass": reproduce_bass,
+    "weights": reproduce_weights,
+}
+
+
+def reproduce(parts, folder, *, scale=FULL, seed=1, jobs=1, overwrite=False, progress=None):
+    """Reproduce parts of the paper.
+
+    Parameters
+    ----------
+    parts : sequence of str
+        Names of the parts, of `PARTS`.
+    folder : path-like
+        Where tables and figures go, made if needed, each part into a folder of its own.
+    scale : Scale, optional
+        How large it is: `FULL`, as the paper, or `QUICK`.
+    seed : int, optional
+        Another seed, another camera.
+    jobs : int, optional
+        Processes in which frames are matched.
+    overwrite : bool, optional
+        Whether an earlier reproduction there may be replaced.
+    progress : callable, optional
+        Called as ``progress(part, done, total)``.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        The table that is written to ``results.ecsv``: ``part``, ``item``, ``quantity``, ``unit``,
+        ``paper``, ``literal``, ``ours``, ``source``.
+
+    Raises
+    ------
+    InputError
+        If there is no such part, or the folder cannot be written to.
+    """
+    for part in parts:
+        if part not in PARTS:
+            raise InputError(f"part must be one of {', '.join(PARTS)}, got {part!r}")
+    folder = Path(folder)
+    target = folder / "results.ecsv"
+    if target.exists() and not overwrite:
+        raise InputError(f"{target}: file exists, and is replaced only with --overwrite")
+    tables = []
+    for part in parts:
+        try:
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        except OSError as problem:
+            raise InputError(f"{folder / part}: cannot be made: {problem.strerror}") from problem
+        tables.append(PARTS[part](folder / part, scale, seed=seed, jobs=jobs, progress=progress))
+    results = vstack(tables)
+    write_table(results, target, overwrite=overwrite)
+    return results

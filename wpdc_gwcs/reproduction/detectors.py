@@ -1,0 +1,207 @@
+"""The 18 detectors: tables 1 and 2, figures 1 and 6, literal and default method side by side.
+
+::
+
+    simulate --25 fields of a detector--> calibrate, both methods --> pool_residuals (table 2)
+                                                                  --> score_frame (error of the WCS)
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from astropy.table import QTable
+
+from wpdc_gwcs.calibration import Settings, calibrate
+from wpdc_gwcs.evaluation import (
+    format_table,
+    pool_residuals,
+    pool_scores,
+    uncorrected_residuals,
+)
+from wpdc_gwcs.io import atomic_path, write_table
+from wpdc_gwcs.plotting import plot_before_after, plot_focal_plane
+from wpdc_gwcs.reproduction.results import tabulate_results
+from wpdc_gwcs.reproduction.scoring import CLOSE_PX, score_run
+from wpdc_gwcs.simulation import simulate
+
+__all__ = ["METHODS", "calibrate_fields", "reproduce_detectors", "simulate_fields"]
+
+# The paper's method to the letter, and what the package does by default.
+METHODS = {"literal": "paper", "ours": "wpdc"}
+# The detector that the paper shows.
+_SHOWN = "g-1"
+
+
+def simulate_fields(detector, scale, *, seed):
+    """Simulate the fields of a detector.
+
+    Parameters
+    ----------
+    detector : str
+        Name of a detector of the camera ``csst-msc``.
+    scale : Scale
+        How large it is.
+    seed : int
+        Of the camera and of the fields.
+
+    Returns
+    -------
+    Simulation
+        One exposure of each field, with a catalog that is the truth.
+    """
+    return simulate(
+        1,
+        camera="csst-msc",
+        detectors=[detector],
+        seed=seed,
+        **scale.fields(seed),
+        **scale.camera,
+    )
+
+
+def calibrate_fields(simulation, scale, *, method="wpdc", jobs=1, **settings):
+    """Calibrate the fields of a detector.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        As from `simulate_fields`.
+    scale : Scale
+        How large it is.
+    method : {"wpdc", "paper"}, optional
+        The default method, or the paper's to the letter.
+    jobs : int, optional
+        Processes in which frames are matched.
+    **settings
+        Of `~wpdc_gwcs.calibration.Settings`.
+
+    Returns
+    -------
+    CalibrationRun
+        The results.
+    """
+    return calibrate(
+        [exposure.frame() for exposure in simulation.exposures],
+        simulation.reference,
+        settings=Settings(method=method, r0=scale.r0, **settings),
+        jobs=jobs,
+    )
+
+
+def _quantities(pooled, score):
+    s = pooled.statistics
+    moments = ("mean_dx", "sigma_dx", "mean_dy", "sigma_dy")
+    return {
+        **{(name, "pix"): getattr(s, name) for name in moments},
+        ("wcs_rms", "pix"): score.wcs_rms,
+        ("wcs_max", "pix"): score.wcs_max,
+        ("share_below_0p01", ""): score.share_below,
+        ("n_stars", ""): s.n,
+        ("n_wrong", ""): score.n_wrong_used,
+    }
+
+
+def reproduce_detectors(folder, scale, *, seed=1, jobs=1, progress=None):
+    """Reproduce the paper's results for the detectors of the Main Survey Camera.
+
+    Parameters
+    ----------
+    folder : Path
+        Where tables and figures go; it must exist.
+    scale : Scale
+        How large it is.
+    seed : int, optional
+        Of the camera and of the fields.
+    jobs : int, optional
+        Processes in which frames are matched.
+    progress : callable, optional
+        Called as ``progress("detectors", done, total)``.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        See `~wpdc_gwcs.reproduction.results.tabulate_results`.
+
+    Notes
+    -----
+    Writes ``table2-literal``, ``table2-ours`` (``.txt`` and ``.tex``), ``table1-g-1.ecsv``,
+    ``focal-plane.png``, and ``before-after-g-1-literal.png`` and ``-ours.png``.
+    """
+    found, pooled, shown = {}, {name: [] for name in METHODS}, []
+    for done, detector in enumerate(scale.detectors):
+        simulation = simulate_fields(detector, scale, seed=seed)
+        numbers = {}
+        for name, method in METHODS.items():
+            run = calibrate_fields(simulation, scale, method=method, jobs=jobs)
+            residuals = pool_residuals(run.calibrations, limit=CLOSE_PX)[0]
+            pooled[name].append(residuals)
+            numbers[name] = _quantities(residuals, pool_scores(score_run(simulation, run))[0])
+            if detector == _SHOWN:
+                numbers[name] |= _draw_shown(run, name, folder)
+            if name == "ours":
+                shown.append(run.calibrations[0])
+            # Of the literal method the solution alone is needed from here on.
+            del run
+        size = simulation.distortion.greatest()
+        found[detector, "largest_distortion", "pix"] = (size, size)
+        for quantity, unit in numbers["ours"]:
+            values = [numbers[name].get((quantity, unit), np.nan) for name in METHODS]
+            found[detector, quantity, unit] = values
+        if progress is not None:
+            progress("detectors", done + 1, len(scale.detectors))
+    size = max(v[0] for (_, quantity, _), v in found.items() if quantity == "largest_distortion")
+    found["all", "largest_distortion", "pix"] = (size, size)
+    for name, residuals in pooled.items():
+        for form, suffix in (("ascii", "txt"), ("latex", "tex")):
+            with atomic_path(folder / f"table2-{name}.{suffix}", overwrite=True) as temporary:
+                temporary.write_text(format_table(residuals, form=form), encoding="utf-8")
+    _draw_focal_plane(shown, scale, seed, folder)
+    return tabulate_results("detectors", found)
+
+
+def _draw_shown(run, name, folder):
+    """Draw the detector that the paper shows, and write its look-up table."""
+    solution = run.calibrations[0].solution
+    axes = plot_before_after(
+        [uncorrected_residuals(c) for c in run.calibrations],
+        [c.matches for c in run.calibrations],
+        image_shape=solution.image_shape,
+        titles=("linear WCS", f"{solution.detector}, {name}"),
+    )
+    axes[0, 0].figure.savefig(folder / f"before-after-{solution.detector}-{name}.png", dpi=110)
+    table = solution.lookup_table
+    if table is None:
+        return {}
+    x, y = np.meshgrid(table.x_grid, table.y_grid)
+    dx, dy = np.asarray(table.dx), np.asarray(table.dy)
+    columns = {"X_grid": x, "Y_grid": y, "dX_LUT": dx, "dY_LUT": dy}
+    listed = QTable({key: value.ravel() for key, value in columns.items()})
+    write_table(listed, folder / f"table1-{solution.detector}-{name}.ecsv", overwrite=True)
+    ends = {"first": (0, 0), "last": (-1, -1)}
+    return {
+        (f"table_{axis}_{end}", "pix"): float(values[at])
+        for end, at in ends.items()
+        for axis, values in (("dx", dx), ("dy", dy))
+    }
+
+
+def _draw_focal_plane(calibrations, scale, seed, folder):
+    """Draw the distortions where the detectors stand: of one pointing, with their solutions."""
+    one = simulate(
+        1,
+        camera="csst-msc",
+        detectors=list(scale.detectors),
+        seed=seed,
+        density=0.0,
+        **scale.camera,
+    )
+    headers = {exposure.detector: exposure.wcs.wcs for exposure in one.exposures}
+    placed = [
+        replace(
+            c, crval=headers[c.solution.detector].crval, cd=headers[c.solution.detector].cd,
+            field=None,
+        )
+        for c in calibrations
+    ]  # fmt: skip
+    axes = plot_focal_plane(placed)
+    axes.figure.savefig(folder / "focal-plane.png", dpi=130, bbox_inches="tight")

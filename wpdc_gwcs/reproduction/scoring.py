@@ -1,0 +1,57 @@
+"""Results of a reproduction held against the truth of its simulation."""
+
+import numpy as np
+
+from wpdc_gwcs.evaluation import score_frame
+
+__all__ = ["CLOSE_PX", "score_run", "sky_error"]
+
+#: The paper counts the area where the solution is better than this, px.
+CLOSE_PX = 0.01
+_MAS = 3.6e6  # per deg
+
+
+def score_run(simulation, run):
+    """Score the frames of a run.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        What the frames were simulated by.
+    run : CalibrationRun
+        Their calibration.
+
+    Returns
+    -------
+    list of TruthScore
+        One for each solved frame.
+    """
+    truths = {exposure.name: exposure for exposure in simulation.exposures}
+    scores = []
+    for calibration in run.calibrations:
+        stars = truths[calibration.frame].observe()[1]
+        stars.rename_column("reference_index", "catalog_index")
+        scores.append(score_frame(calibration, truths[calibration.frame], stars, limit=CLOSE_PX))
+    return scores
+
+
+def sky_error(run, scores):
+    """Give the error of the WCS along east and north, over all frames.
+
+    Parameters
+    ----------
+    run : CalibrationRun
+        The calibration.
+    scores : list of TruthScore
+        Of its frames, in order.
+
+    Returns
+    -------
+    alpha, delta : float
+        Root mean squares, mas.
+    """
+    errors = [
+        c.cd @ [s.error_x.ravel(), s.error_y.ravel()] * _MAS
+        for c, s in zip(run.calibrations, scores, strict=True)
+    ]
+    return tuple(float(v) for v in np.sqrt(np.mean(np.concatenate(errors, axis=1) ** 2, axis=1)))

@@ -1,0 +1,119 @@
+"""Where cameras point, and where that puts each of their detectors on the sky."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.wcs import WCS
+
+from wpdc_gwcs.simulation.stars import offset_positions
+from wpdc_gwcs.sky import angles, directions
+
+__all__ = ["Pointing", "aim"]
+
+
+@dataclass(frozen=True)
+class Pointing:
+    """Where a camera points.
+
+    Parameters
+    ----------
+    ra, dec : float
+        Direction of its reference point, deg.
+    roll : float
+        Position angle of its y axis there, north through east, deg.
+    scale : float
+        Angle of a pixel, arcsec.
+    """
+
+    ra: float
+    dec: float
+    roll: float
+    scale: float
+
+    @property
+    def matrix(self):
+        """Pixels of the focal plane to the tangent plane, deg."""
+        c, s = np.cos(np.deg2rad(self.roll)), np.sin(np.deg2rad(self.roll))
+        return self.scale / 3600 * np.array([[-c, s], [s, c]])
+
+    def linear_wcs(self, detector, place, *, shared_tangent):
+        """Give the WCS of a detector's undistorted pixels.
+
+        Parameters
+        ----------
+        detector : SimulatedDetector
+            The detector.
+        place : (float, float)
+            Where its center is in the focal plane, px.
+        shared_tangent : bool
+            Whether the tangent point is the camera's, or its own at its center.
+
+        Returns
+        -------
+        `~astropy.wcs.WCS`
+            A gnomonic WCS.
+
+        Notes
+        -----
+        A detector with a tangent point of its own is turned rigidly with the camera, so that all
+        exposures have one map from pixels to the camera's own sphere.
+        """
+        cd, crpix, crval = self.matrix, np.add(detector.distortion.center, 1), (self.ra, self.dec)
+        if shared_tangent:
+            crpix = crpix - np.multiply(detector.axes, place)
+        else:
+            crval, turn = self._carry(*(cd @ place))
+            cd = cd if turn is None else turn @ cd
+        wcs = WCS(naxis=2)
+        wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+        wcs.wcs.cunit = ["deg", "deg"]
+        wcs.wcs.crpix = crpix
+        wcs.wcs.crval = crval
+        wcs.wcs.cd = cd * detector.axes
+        wcs.wcs.radesys = "ICRS"
+        wcs.array_shape = detector.image_shape
+        wcs.wcs.set()
+        return wcs
+
+    def _carry(self, east, north):
+        """Direction at an offset in the tangent plane, and how the plane's axes turn there.
+
+        East and north are carried along the great circle to it; `None` where there is no way to go.
+        """
+        if east == north == 0:
+            return (self.ra, self.dec), None
+        p, e, n = directions(self.ra, self.dec)
+        along = np.deg2rad(east) * e + np.deg2rad(north) * n
+        there = p + along
+        there /= np.linalg.norm(there)
+        carried = [v - (v @ there) / (1 + p @ there) * (p + there) for v in (e, n)]
+        ra, dec = angles(there)
+        _, e, n = directions(ra, dec)
+        return (ra, dec), np.array([[a @ v for v in carried] for a in (e, n)])
+
+
+def aim(ra, dec, roll, scale, middle):
+    """Point a camera so that a place in its focal plane falls on a direction.
+
+    Parameters
+    ----------
+    ra, dec : float
+        The direction, deg.
+    roll : float
+        Position angle of the y axis, deg.
+    scale : float
+        Angle of a pixel, arcsec.
+    middle : (float, float)
+        The place, px of the focal plane.
+
+    Returns
+    -------
+    Pointing
+        The pointing; next to a pole, where position angles change within the camera, the place
+        falls near the direction only.
+    """
+    pointing = Pointing(float(ra), float(dec), float(roll), scale)
+    east, north = pointing.matrix @ middle
+    if np.hypot(east, north) == 0:
+        return pointing
+    return Pointing(*map(float, offset_positions(ra, dec, -east, -north)), float(roll), scale)

@@ -1,0 +1,114 @@
+"""The truth about a frame: an exact map from its pixels to the sky and back."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.wcs import WCS
+
+from wpdc_gwcs.simulation.distortion import Distortion
+
+__all__ = ["FrameTruth"]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTruth:
+    """What is true of a frame, whatever is said of it.
+
+    Parameters
+    ----------
+    name : str
+        Name of the frame.
+    detector : str
+        Name of the detector.
+    epoch : float
+        Epoch of mid-exposure, Julian years.
+    exposure : str or None
+        What the exposures of all detectors of a mosaic have in common; `None` of a single detector.
+    distortion : Distortion
+        The distortion of the detector.
+    linear_wcs : `astropy.wcs.WCS`
+        The true WCS of undistorted pixels.
+    """
+
+    name: str
+    detector: str
+    epoch: float
+    exposure: str | None
+    distortion: Distortion
+    linear_wcs: WCS
+
+    @property
+    def image_shape(self):
+        """Shape of the detector ``(ny, nx)``."""
+        return self.distortion.image_shape
+
+    def sky(self, x, y):
+        """Give the true sky position of detector pixels.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Detector pixel coordinates, zero based.
+
+        Returns
+        -------
+        ra, dec : ndarray
+            ICRS, degrees.
+        """
+        return self.linear_wcs.wcs_pix2world(*self.distortion.undistort(x, y), 0)
+
+    def pixel(self, ra, dec):
+        """Give the true detector pixel of sky positions.
+
+        Parameters
+        ----------
+        ra, dec : array_like
+            ICRS, degrees, of the frame's own part of the sky.
+
+        Returns
+        -------
+        x, y : ndarray
+            Detector pixel coordinates, zero based, also beyond the edges of the detector.
+        """
+        return self.distortion.distort(*self.linear_wcs.wcs_world2pix(ra, dec, 0))
+
+    def error_at(self, wcs, x, y):
+        """Error of a WCS against the truth at positions on the detector.
+
+        Parameters
+        ----------
+        wcs : callable or object with ``pixel_to_world_values``
+            The WCS to judge: zero-based pixels to ICRS degrees.
+        x, y : (N,) array_like
+            Detector pixels.
+
+        Returns
+        -------
+        dx, dy : (N,) ndarray
+            Error in pixels, along the axes of undistorted pixels.
+        """
+        to_sky = getattr(wcs, "pixel_to_world_values", wcs)
+        found_x, found_y = self.linear_wcs.wcs_world2pix(*to_sky(x, y), 0)
+        true_x, true_y = self.distortion.undistort(x, y)
+        return found_x - true_x, found_y - true_y
+
+    def wcs_error(self, wcs, *, n_grid=101):
+        """Error of a WCS against the truth on a regular grid over the detector.
+
+        Parameters
+        ----------
+        wcs : callable or object with ``pixel_to_world_values``
+            The WCS to judge: zero-based pixels to ICRS degrees.
+        n_grid : int, optional
+            Number of grid points per axis.
+
+        Returns
+        -------
+        x, y : (n_grid**2,) ndarray
+            Detector pixels of the grid.
+        dx, dy : (n_grid**2,) ndarray
+            Error in pixels, along the axes of undistorted pixels.
+        """
+        ny, nx = self.image_shape
+        y, x = np.mgrid[0 : ny - 1 : n_grid * 1j, 0 : nx - 1 : n_grid * 1j].reshape(2, -1)
+        return x, y, *self.error_at(wcs, x, y)
