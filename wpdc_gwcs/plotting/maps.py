@@ -16,6 +16,22 @@ def draw_maps(maps, extent, image_shape, *, level=99):
 
     The signed ones share a scale that is symmetric about zero and ends at a percentile, so that a
     cell with one bad star does not hide the others.
+
+    Parameters
+    ----------
+    maps : sequence of (ndarray, str, bool)
+        Values ``(ny, nx)`` of each, the label of its scale, and whether they have a sign.
+    extent : (float, float, float, float)
+        Left, right, lower and upper end in px.
+    image_shape : (int, int)
+        Shape ``(ny, nx)`` of the detector.
+    level : float, optional
+        Percentile of the absolute values at which the signed scale ends.
+
+    Returns
+    -------
+    `~matplotlib.figure.Figure`
+        The figure.
     """
     ny, nx = image_shape
     figure = new_figure(11.5, 11.5 / 3 * min(ny / nx, 1.6) + 1.1)
