@@ -740,6 +740,26 @@ class TestBadFits:
         with pytest.raises(FileFormatError, match="must hold a header with CTYPE1"):
             read(tmp_path / "a.fits")
 
+    @pytest.mark.parametrize(
+        ("cards", "message"),
+        [
+            ({"CRPIX1": 1e30}, "CRPIX must be within 1e.09 px, got 1e.30"),
+            ({"CD1_1": 1e-4, "CD1_2": 0.0, "CD2_1": 0.0, "CD2_2": 1e-11}, "b.fits: .*(CD|cd)"),
+            ({"PV1_1": 0.0, "PV2_1": 0.0}, "PV terms must not put all pixels into one line"),
+            ({"PV1_1": 0.0, "PV2_1": 1.0}, "PV terms must not put all pixels into one line"),
+        ],
+    )
+    @pytest.mark.parametrize("reader", [read, read_any])
+    def test_what_is_no_wcs(self, tmp_path, reader, cards, message):
+        header = fits.Header({"CTYPE1": "RA---TPV", "CTYPE2": "DEC--TPV"})
+        for name, value in {"CRVAL": 10.0, "CRPIX": 5.0}.items():
+            header[f"{name}1"] = header[f"{name}2"] = value
+        header["CD1_1"] = header["CD2_2"] = 1e-4
+        header.update(cards)
+        fits.writeto(tmp_path / "b.fits", np.zeros((9, 9)), header)
+        with pytest.raises(FileFormatError, match=message):
+            reader(tmp_path / "b.fits")
+
     def test_several_headers(self, tmp_path, calibration):
         write(calibration, tmp_path / "a.fits", format="tpv")
         header = fits.getheader(tmp_path / "a.fits")

@@ -23,7 +23,7 @@ from wpdc_gwcs.wcs import build_wcs
 __all__ = ["Calibration", "DistortionSolution"]
 
 # A reference point further off than this, px, is no number of any camera.
-_FARTHEST = 1e9
+FARTHEST_PX = 1e9
 # Scales of the two axes differ by less than this factor, or the matrix has no inverse worth having.
 _MOST_CONDITION = 1e6
 
@@ -94,8 +94,8 @@ class DistortionSolution(InMemory):
 
     def __post_init__(self):
         crpix = frozen_array(self, "crpix", shape=(2,))
-        if np.any(np.abs(crpix) > _FARTHEST):
-            raise ValueError(f"crpix must be within {_FARTHEST:g} px, got {crpix.tolist()}")
+        if np.any(np.abs(crpix) > FARTHEST_PX):
+            raise ValueError(f"crpix must be within {FARTHEST_PX:g} px, got {crpix.tolist()}")
         _freeze_pointing(self)
         _freeze_sigma(self, "table_sigma")
         freeze_attributes(self, "statistics", "settings", "provenance")

@@ -201,15 +201,20 @@ def read_fits(path):
         )
     if instrument is None or not _agree(instrument, tan):
         instrument = {"crpix": tan.crpix, "cd": tan.cd, "crval": tan.crval, "pv": tan.pv}
-    solution = DistortionSolution(
-        detector=header_text(header, "DETECTOR") or header_text(header, "EXTNAME") or "detector",
-        image_shape=tan.image_shape,
-        lookup_table=table,
-        **instrument,
-        provenance={"file": str(path)},
-    )
     frame = header_text(header, "FRAME") or stem_of(path)
-    return Calibration(frame=frame, solution=solution, crval=tan.crval, cd=tan.cd)
+    try:
+        solution = DistortionSolution(
+            detector=header_text(header, "DETECTOR")
+            or header_text(header, "EXTNAME")
+            or "detector",
+            image_shape=tan.image_shape,
+            lookup_table=table,
+            **instrument,
+            provenance={"file": str(path)},
+        )
+        return Calibration(frame=frame, solution=solution, crval=tan.crval, cd=tan.cd)
+    except ValueError as problem:
+        raise FileFormatError(f"{name}: {first_line(problem)}") from problem
 
 
 def _read_own_tables(hdus, header, path):

@@ -17,6 +17,7 @@ from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.headers import header_number, header_shape, header_text, header_value
 from wpdc_gwcs.models import PVPolynomial, pv_terms
 from wpdc_gwcs.models.attitude import fold_attitude
+from wpdc_gwcs.solution import FARTHEST_PX
 
 __all__ = ["PV_CARD", "TanHeader", "idle_pv", "parse_tan"]
 
@@ -112,7 +113,8 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
     Raises
     ------
     InputError
-        If the axes are not celestial, a card is missing or not a number, or CD is singular.
+        If the axes are not celestial, a card is missing or not a number, CD is singular, or the PV
+        terms are.
 
     Notes
     -----
@@ -147,6 +149,11 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
     scale = [_degrees(header, axis, name, error) for axis in (1, 2)]
     crval = np.array([number(f"CRVAL{axis}") * scale[axis - 1] for axis in (1, 2)])[order]
     crpix = np.array([number("CRPIX1"), number("CRPIX2")]) - 1.0
+    if np.abs(crpix).max() > FARTHEST_PX:
+        raise error(
+            f"{name}: CRPIX must be within {FARTHEST_PX:g} px, got {crpix[0] + 1:g}, "
+            f"{crpix[1] + 1:g}"
+        )
     cd = (_linear(header, order, number, name, error) * np.array(scale)[:, None])[order]
     spread = np.abs(cd).max()
     if not spread > 0 or abs(np.linalg.det(cd)) < 1e-10 * spread**2:
@@ -155,6 +162,8 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
     if not -90.0 <= crval[1] <= 90.0:
         raise error(f"{name}: declination CRVAL must lie in [-90, 90] deg, got {crval[1]:g}")
     pv = _read_pv(numbers if is_tpv else set(), order, number, name, error)
+    shape = header_shape(header)
+    _require_area(pv, cd, crpix, shape, name, error)
     # Paper II: the default LONPOLE of a zenithal projection is 0 where the pole is the reference
     # point.
     lonpole = number("LONPOLE", required=False, default=180.0 if crval[1] < 90.0 else 0.0)
@@ -162,7 +171,16 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
         a = np.radians(180.0 - lonpole)
         turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
         cd, pv = turn @ cd, fold_attitude(pv, turn)
-    return TanHeader(crpix, cd, crval, pv, header_shape(header))
+    return TanHeader(crpix, cd, crval, pv, shape)
+
+
+def _require_area(pv, cd, crpix, shape, name, error):
+    """Refuse terms that put the image into a line or a point."""
+    # Not at the reference point, where radial terms have no derivatives.
+    place = crpix + 1.0 if shape is None else 0.3 * np.array(shape[::-1])
+    area = np.linalg.det(pv.jacobian(*(cd @ (place - crpix))))
+    if not abs(area) > 0:
+        raise error(f"{name}: PV terms must not put all pixels into one line or point, do so")
 
 
 def idle_pv(header):
