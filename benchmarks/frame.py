@@ -16,6 +16,7 @@ SCAMP also without the laboratory's writer of its catalogs (``scamp.py`` under W
 """
 
 import argparse
+import itertools
 import json
 import os
 import shutil
@@ -64,17 +65,16 @@ def run(frame, reference, output):
     from wpdc_gwcs import calibrate
     from wpdc_gwcs.io import read_frames
 
-    marks = [("import", time.process_time())]
+    marks = [("import", 0.0), ("reading", time.process_time())]
 
     def hear(stage, done, total):
         if total == 0:
             marks.append((stage, time.process_time()))
 
-    frames = read_frames(frame)
-    calibrate(frames, reference, output=output, overwrite=True, progress=hear)
+    calibrate(read_frames(frame), reference, output=output, overwrite=True, progress=hear)
     marks.append(("", time.process_time()))
-    stages = {"import": marks[0][1]}
-    for (stage, began), (_, ended) in zip(marks[1:-1], marks[2:], strict=True):
+    stages = {}
+    for (stage, began), (_, ended) in itertools.pairwise(marks):
         stages[stage] = stages.get(stage, 0.0) + ended - began
     print(json.dumps(stages))
 
