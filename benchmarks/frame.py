@@ -47,8 +47,8 @@ def simulation_of(name, seed):
 
     from wpdc_gwcs import simulate
 
-    options = {"fwhm": 1.8, "psf_variation": 0.1, "slope": 0.3, "magnitudes": (16.0, 24.0)}
-    options |= {"reference_limit": 21.5, "limit_snr": 5.0, "spurious": 0.0, "lost": 0.0}
+    options = {"fwhm": 1.8, "psf_variation": 0.1, "slope": 0.2, "magnitudes": (17.0, 24.0)}
+    options |= {"reference_limit": 21.5, "limit_snr": 12.0, "spurious": 0.0, "lost": 0.0}
     return simulate(1, seed=seed, detector=name, pixel_scale=SCALE * u.arcsec,
                     **options, **FRAMES[name])  # fmt: skip
 
