@@ -11,8 +11,9 @@ from wpdc_gwcs.centroids._profile import Profile
 
 __all__ = ["Painter", "Residual", "Scene"]
 
-# Pixels of an image that are worked on at a time: they stay in the cache.
-_STRIP = 3_000_000
+# Pixels that are worked on at a time: many, where stars are cut out of them, and as many as stay in
+# the cache of a processor, where they are not.
+_STRIP, _CACHED = 3_000_000, 250_000
 
 # Half-widths in px that stars are drawn with, up to that of the profile: faint ones are smaller.
 _SIZES = (3, 5, 8, 12)
@@ -238,19 +239,20 @@ class Residual:
         part = self.background.rows(start, stop)
         image = part.image if self.subtracted else np.empty_like(part.image)
         rms = np.empty(part.shape, np.float32)
-        # In strips: work space for whole images takes longer to be had than the work itself.
-        step = max(1, _STRIP // part.shape[1])
-        work = np.empty((min(step, len(rms)), part.shape[1]), np.float32)
+        step = max(1, _CACHED // part.shape[1])
+        work = np.empty((2, min(step, len(rms)), part.shape[1]), np.float32)
         for first in range(0, len(rms), step):
             k = slice(first, min(first + step, len(rms)))
-            model = _paint(work[: k.stop - first], self._models, start + first)
-            variance = part.rms[k] ** 2 + (_MODEL_ERROR * model) ** 2
-            if self.gain is not None:
-                photons = np.maximum(model, 0) / self.gain
-                if part.photons is not None:
-                    photons *= part.photons[k]
-                variance += photons
-            np.sqrt(variance, out=rms[k])
+            model, other = work[:, : k.stop - first]
+            variance = np.multiply(part.rms[k], part.rms[k], out=rms[k])
+            _paint(model, self._models, start + first)
             if not self.subtracted:
                 np.subtract(part.image[k], model, out=image[k])
+            np.multiply(model, _MODEL_ERROR, out=other)
+            variance += np.multiply(other, other, out=other)
+            if self.gain is not None:
+                np.maximum(model, 0, out=model)
+                model /= self.gain
+                variance += model if part.photons is None else model * part.photons[k]
+            np.sqrt(variance, out=variance)
         return replace(part, image=image, rms=rms)

@@ -6,6 +6,7 @@ import numpy as np
 import sep
 
 from wpdc_gwcs.detection._mosaic import has_pattern, plane_slices, star_responses
+from wpdc_gwcs.detection._strips import row_strips
 from wpdc_gwcs.exceptions import DetectionError
 from wpdc_gwcs.robust import robust_scatter
 
@@ -24,9 +25,6 @@ _COLD = 10.0
 # Cells in px within which a weight map tells the noise of the sky: the median over them does not
 # see the photons of stars, which many maps of variances hold and which the gain brings.
 _WEIGHT_CELL = 16
-
-# Rows worked on at a time: temporary arrays of a whole image take longer to be had than the work.
-_ROWS = 256
 
 # Pixels that may be saturated, in scatters of all pixels above their median: no sky reaches there.
 _BRIGHT = 5.0
@@ -289,11 +287,13 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
 def _bright_pixels(data, limit):
     """Pixels above a limit, masked ones too."""
     indices, values = [], []
-    for first in range(0, len(data), _ROWS):
-        part = data[first : first + _ROWS].reshape(-1)
-        high = np.flatnonzero(part > limit)
-        indices.append(high + first * data.shape[1])
-        values.append(part[high])
+    strips = row_strips(data.shape)
+    work = np.empty((strips[0].stop, data.shape[1]), bool)
+    for rows in strips:
+        part = data[rows]
+        high = np.flatnonzero(np.greater(part, limit, out=work[: len(part)]))
+        indices.append(high + rows.start * data.shape[1])
+        values.append(part.reshape(-1)[high])
     return BrightPixels(np.concatenate(indices), np.concatenate(values))
 
 
@@ -310,8 +310,7 @@ def _finished(background):
     if rms.min() > floor and not image.min() < -_COLD * rms.min():
         return background
     bad = np.zeros(image.shape, bool) if bad is None else bad.copy()
-    for first in range(0, len(image), _ROWS):
-        rows = slice(first, first + _ROWS)
+    for rows in row_strips(image.shape):
         # Cells of constant pixels (padding, dead regions) have no noise and nothing to detect.
         dead = ~(rms[rows] > floor)
         rms[rows][dead] = noise
@@ -345,10 +344,15 @@ def _in_units(data, pedestal, unit, *, overwrite):
     """Difference from a first level, so that float32 keeps the noise on a high pedestal."""
     here = overwrite and data.dtype == np.float32 and data.flags.carray
     image = data if here else np.empty(data.shape, dtype=np.float32)
-    for first in range(0, len(data), _ROWS):
-        rows = slice(first, first + _ROWS)
-        with np.errstate(over="ignore", invalid="ignore"):
-            image[rows] = (data[rows].astype(float) - pedestal) / unit
+    strips = row_strips(data.shape)
+    work = np.empty((strips[0].stop, data.shape[1]))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for rows in strips:
+            part = work[: rows.stop - rows.start]
+            part[:] = data[rows]
+            part -= pedestal
+            part /= unit
+            image[rows] = part
     return image
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import sep
 
 from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, cutouts, mode, sizes, window
+from wpdc_gwcs.detection._strips import high_pixels
 
 __all__ = ["extract_peaks", "is_broad", "search", "star_size", "typical_fwhm"]
 
@@ -84,7 +85,8 @@ def search(background, threshold, deblend_contrast, fwhm=0.0):
         start = max(first - overlap, 0)
         strip = background.rows(start, min(last + overlap, n_rows))
         # Room for all pixels of all sources; no more, because sep writes to all of it every time.
-        active = np.count_nonzero(strip.image > threshold * strip.rms)
+        high = high_pixels(strip.image, strip.rms, threshold)
+        active = sum(np.count_nonzero(part) for _, part in high)
         sep.set_extract_pixstack(min(300_000 + 3 * active, 300_000 + strip.image.size))
         found = sep.extract(
             strip.image,

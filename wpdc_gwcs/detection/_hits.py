@@ -7,6 +7,7 @@ import numpy as np
 from scipy.special import erf
 
 from wpdc_gwcs.detection._extract import star_size
+from wpdc_gwcs.detection._strips import high_pixels
 
 __all__ = ["mask_hits"]
 
@@ -28,9 +29,6 @@ _MARGIN = 0.6
 
 # Standard deviations by which noise may take light from the pixels beside, or add to the peak.
 _NOISE = 2.5
-
-# Rows searched at a time.
-_ROWS = 256
 
 # Opposite neighbors in four directions.
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -110,10 +108,9 @@ def mask_hits(background, *, overwrite=False):
 def _peaks(image, rms):
     """Rows and columns of the pixels tested; at the rim, neighbors are missing."""
     rows, columns = [], []
-    for first in range(1, len(image) - 1, _ROWS):
-        inner = slice(first, min(first + _ROWS, len(image) - 1)), slice(1, -1)
-        y, x = np.nonzero(image[inner] > _MIN_PEAK * rms[inner])
-        rows.append(y + first)
+    for first, high in high_pixels(image[1:-1], rms[1:-1], _MIN_PEAK):
+        y, x = np.nonzero(high[:, 1:-1])
+        rows.append(y + first + 1)
         columns.append(x + 1)
     return np.concatenate(rows), np.concatenate(columns)
 
