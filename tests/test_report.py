@@ -1,76 +1,181 @@
 """The report is one page that says what the tables say."""
 
 import io
+import json
 import re
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from astropy.table import QTable, Table
+from PIL import Image
 
 from wpdc_gwcs.models import LookupTable, PVPolynomial
 from wpdc_gwcs.report import write_report
 from wpdc_gwcs.solution import DistortionSolution
 
 
-class Tags(HTMLParser):
-    """Counts tags and collects the sources of images."""
+class Page(HTMLParser):
+    """Counts tags, and collects images, rows of tables, links, and what they lead to."""
 
-    def __init__(self):
+    def __init__(self, text):
         super().__init__()
-        self.count, self.sources = {}, []
+        self.in_cell = False
+        self.count, self.images, self.tables, self.links, self.ids = {}, [], [], [], set()
+        self.feed(text)
 
     def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
         self.count[tag] = self.count.get(tag, 0) + 1
-        self.sources += [value for name, value in attrs if name == "src"]
+        self.ids |= {attrs["id"]} if "id" in attrs else set()
+        if tag == "img":
+            self.images.append(attrs)
+        elif tag == "a":
+            self.links.append(attrs["href"].removeprefix("#"))
+        elif tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("th", "td"):
+            self.tables[-1][-1].append("")
+            self.in_cell = True
+
+    def handle_endtag(self, tag):
+        self.in_cell = self.in_cell and tag not in ("th", "td")
+
+    def handle_data(self, data):
+        if self.in_cell:
+            self.tables[-1][-1][-1] += data
 
 
-@pytest.fixture(scope="module")
-def page():
-    rng = np.random.default_rng(5)
-    summary = QTable(
-        {
-            "frame": ["good", "<bad>"],
-            "detector": ["chip-1", "chip-2"],
-            "status": ["solved", "failed"],
-            "reason": ["", "no match & no hope"],
-            "sigma_dx": [0.0512345, np.nan],
-        }
-    )
+def stars(rng, n, sigma=0.05):
+    columns = {name: rng.uniform(0, 99, n) for name in "xy"}
+    columns |= {name: rng.normal(0, sigma, n) for name in ("dx", "dy")}
+    columns["phot_g_mean_mag"] = rng.uniform(15, 20, n)
+    columns["holdout"] = np.arange(n) < n // 4
+    columns["used"] = ~columns["holdout"]
+    return Table(columns)
+
+
+def solution_of(name):
     grid = np.linspace(-0.5, 99.5, 5)
     table = LookupTable(grid, grid, np.ones((5, 5)), np.ones((5, 5)))
-    solution = DistortionSolution(
-        "chip-1", (100, 100), np.array([49.5] * 2), np.eye(2) * 1e-5, np.zeros(2), PVPolynomial(),
+    return DistortionSolution(
+        name, (100, 100), np.array([49.5] * 2), np.eye(2) * 1e-5, np.zeros(2), PVPolynomial(),
         lookup_table=table,
     )  # fmt: skip
-    columns = {"x": rng.uniform(0, 99, 200), "y": rng.uniform(0, 99, 200)}
-    columns |= {"dx": rng.normal(size=200), "dy": rng.normal(size=200)}
-    columns["dx"][:50] = 0.25
-    columns["holdout"] = np.arange(200) < 50
-    columns["used"] = ~columns["holdout"]
+
+
+def written(*args, **options):
     file = io.StringIO()
-    write_report(summary, {"chip-1": solution}, {"good": Table(columns)}, file, title="Night 1")
+    write_report(*args, file, **options)
     return file.getvalue()
 
 
-def test_page_holds_every_frame_and_figure(page):
-    tags = Tags()
-    tags.feed(page)
-    # summary: heading and two frames; statistics: heading, stars of the fit, held-out stars
-    assert tags.count["tr"] == 3 + 3
-    # look-up table; maps, residuals against position, distribution
-    assert tags.count["img"] == 1 + 3
-    assert all(source.startswith("data:image/png;base64,iVBOR") for source in tags.sources)
-    assert "1 of 2 frames solved" in page
-    assert "0.0512" in page
-    assert "Detector chip-1" in page
+@pytest.fixture(scope="module")
+def text():
+    rng = np.random.default_rng(5)
+    names = ["a1", "a2", "<b>", "b2"]
+    summary = QTable(
+        {
+            "frame": names,
+            "detector": ["chip-1", "chip-1", "chip-2", "chip-2"],
+            "status": ["solved", "degraded", "failed", "solved"],
+            "reason": ["", "few stars", "no match & no hope", ""],
+            "n_matched": [200, 200, 0, 200],
+            "sigma_dx": [0.0512345, 0.04, np.nan, 0.03],
+            "rms_mas": [1.0, 2.0, np.nan, 7.125],
+            "purity": [0.98, 0.97, 0.1, 0.99],
+        }
+    )
+    matches = {name: stars(rng, 200) for name in ("a1", "a2", "b2")}
+    matches["a2"]["dx"] += 0.25
+    return written(
+        summary,
+        {"chip-1": solution_of("chip-1")},
+        matches,
+        title="Night 1",
+        about={"settings": {"degree": "auto", "r0": None}, "software": {"numpy": "2.0"}},
+    )
 
 
-def test_statistics_of_the_stars(page):
-    fit, held_out = re.findall(r"<td>(?:in the fit|held out)</td>.*?</tr>", page)
-    assert "<td>150</td>" in fit
-    # 50 held-out stars, none clipped by their dx, all with a dx of 0.25 px
-    assert re.search(r"<td>50</td><td>(50|4\d)</td><td>0.2500</td>", held_out)
+@pytest.fixture
+def page(text):
+    return Page(text)
+
+
+def test_detectors_come_first_and_pooled(text, page):
+    first = page.tables[0]
+    assert first[0][0] == "detector"
+    names = [c.split("px")[0].split("mas")[0] for c in first[0]]
+    chip = dict(zip(names, first[1], strict=True))
+    assert chip["detector"] == "chip-1"
+    assert (chip["frames"], chip["solved"], chip["degraded"]) == ("2", "1", "1")
+    assert chip["stars"] == "300"  # of 400, 100 are held out
+    # half of the stars are 0.25 px off
+    assert abs(float(chip["mean dx"]) - 0.125) < 0.02
+    assert abs(float(chip["sigma dx"]) - np.hypot(0.05, 0.125)) < 0.01
+    assert chip["rms"] == "1.50"
+    assert text.index('<h2 id="detectors">') < text.index("Detector chip-1</h2>")
+    assert text.index("Detector chip-1</h2>") < text.index('<h2 id="frames">')
+
+
+def test_counts_and_contents(text, page):
+    assert "4 frames: 2 solved, 1 degraded, 1 failed." in text
+    assert set(page.links) <= page.ids
+    assert {"detectors", "frames", "each", "settings", "detector-0", "detector-1"} <= page.ids
+
+
+def test_frames_have_the_important_columns_and_are_folded(text, page):
+    frames = page.tables[1]
+    assert frames[0][0] == "frame"
+    assert "purity" not in frames[0]
+    assert [row[0].strip() for row in frames[1:]] == ["a1", "a2", "<b>", "b2"]
+    assert frames[3][-1] == "no match & no hope"
+    assert "0.0512" in frames[1]
+    assert "7.12" in frames[4]
+    # all columns, and each frame that has matches
+    assert page.count["details"] == 1 + 3
+    assert any("purity" in table[0] for table in page.tables)
+    assert "<details open" not in text
+    assert text.count('class="failed"') == 2
+
+
+def test_statistics_of_a_frame(page):
+    tables = [t for t in page.tables if t[1][0] == "in the fit"]
+    assert len(tables) == 3
+    (_, fit, held) = tables[1]
+    assert (fit[1], held[:2]) == ("150", ["held out", "50"])
+    assert abs(float(fit[2]) - 0.25) < 0.02
+
+
+def test_images(page):
+    # chip-1: both maps, magnitudes, distribution, table; chip-2: magnitudes, distribution; a1, a2,
+    # and b2, whose detector has no map
+    assert len(page.images) == 4 + 2 + 3
+    for image in page.images:
+        assert image["src"].startswith("data:image/webp;base64,")
+        assert image["alt"]
+        assert int(image["width"]) > 300
+
+
+def test_settings(page):
+    rows = [row for table in page.tables for row in table]
+    assert ["degree", "auto"] in rows
+    assert ["r0", "none"] in rows
+    assert ["numpy", "2.0"] in rows
+
+
+def test_dark_and_light_are_both_provided(text):
+    assert "color-scheme: light dark" in text
+    assert "prefers-color-scheme: dark" in text
+
+
+def test_page_is_self_contained_and_escaped(text):
+    assert not re.search(r"https?://", text)
+    assert "&lt;b&gt;" in text
+    assert "<b>" not in text
+    assert "no match &amp; no hope" in text
 
 
 def test_detector_without_table_or_solution(rng):
@@ -78,22 +183,70 @@ def test_detector_without_table_or_solution(rng):
     columns = {name: rng.normal(size=20) for name in ("x", "y", "dx", "dy")}
     matches = {"a": Table(columns | {"used": np.ones(20, bool), "holdout": np.zeros(20, bool)})}
     bare = DistortionSolution(
-        "chip-1", (80, 100), np.zeros(2), np.eye(2) * 1e-5, np.zeros(2), PVPolynomial()
-    )
+        "chip-1", (80, 100), np.zeros(2), np.eye(2) * 1e-5, np.zeros(2), PVPolynomial(),
+        settings={"method": "paper"},
+    )  # fmt: skip
     summary["reason"] = np.ma.masked_all(1, dtype="U5")
-    file = io.StringIO()
-    write_report(summary, {"chip-1": bare}, matches, file)
-    assert "<td>solved</td><td></td>" in file.getvalue()
-    assert "100 x 80 px; no look-up table." in file.getvalue()
-    file = io.StringIO()
-    write_report(summary, {}, matches, file)
-    tags = Tags()
-    tags.feed(file.getvalue())
-    assert tags.count["img"] == 2
+    text = written(summary, {"chip-1": bare}, matches)
+    assert "100 x 80 px, by the paper&#39;s literal method; no look-up table." in text
+    assert "1 frame: 1 solved." in text
+    page = Page(text)
+    # The only frame of a detector is what is shown of the detector.
+    assert len(page.images) == 2
+    assert ["method", "paper"] in [row for table in page.tables for row in table]
+    text = written(summary, {}, matches)
+    assert "No solution of it is at hand." in text
+    assert len(Page(text).images) == 2
 
 
-def test_page_is_self_contained_and_escaped(page):
-    assert not re.search(r"https?://", page)
-    assert "&lt;bad&gt;" in page
-    assert "<bad>" not in page
-    assert "no match &amp; no hope" in page
+def test_nothing_solved():
+    summary = Table({"frame": ["a"], "detector": ["c"], "status": ["failed"], "reason": ["no"]})
+    text = written(summary, {}, {})
+    assert "1 frame: 1 failed." in text
+    assert Page(text).images == []
+    assert "settings" not in Page(text).ids
+
+
+@pytest.mark.parametrize("n_detectors", [1, 18])
+def test_many_frames_are_a_small_page(n_detectors):
+    rng = np.random.default_rng(1)
+    names = [f"night_20170430_exposure_{k:03d}" for k in range(72)]
+    detectors = [f"d{k % n_detectors}" for k in range(72)]
+    summary = Table({"frame": names, "detector": detectors, "status": ["solved"] * 72})
+    # As large as they get: figures of one frame and of one detector stand for all.
+    sizes = []
+    text = written(
+        summary[:2] if n_detectors == 1 else summary[::4],
+        {d: solution_of(d) for d in detectors},
+        {name: stars(rng, 5000) for name in (names[:2] if n_detectors == 1 else names[::4])},
+    )
+    for image in Page(text).images:
+        sizes.append((len(image["src"]), image["alt"]))
+    frame = max([s for s, alt in sizes if re.match(r"residuals of night_\w+$", alt)], default=0)
+    detector = sum(s for s, alt in sizes if not re.match(r"residuals of night_\w+$", alt))
+    assert 72 * frame + detector < 2_800_000
+
+
+def test_images_can_be_read(page):
+    import base64
+
+    data = base64.b64decode(page.images[0]["src"].partition(",")[2])
+    image = Image.open(io.BytesIO(data))
+    assert (image.width, image.height) == tuple(
+        int(page.images[0][name]) for name in ("width", "height")
+    )
+    assert image.convert("L").getextrema() != (255, 255)
+
+
+def test_settings_of_a_folder_are_found(tmp_path):
+    from wpdc_gwcs.cli.report import about_run
+
+    assert about_run(tmp_path) is None
+    manifest = {
+        "run": "abc", "created": "2026", "software": {"numpy": "2"}, "settings": {"r0": 3},
+        "catalog": {}, "solution": None, "update": False, "inputs": [], "frames": {},
+    }  # fmt: skip
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    about = about_run(tmp_path)
+    assert about["settings"] == {"r0": 3}
+    assert about["run"] == {"run": "abc", "began": "2026", "input files": 0}

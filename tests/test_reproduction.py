@@ -8,6 +8,9 @@ from astropy.table import Table
 from wpdc_gwcs.cli.app import run
 from wpdc_gwcs.exceptions import InputError
 from wpdc_gwcs.reproduction import CLAIMS, PARTS, Scale, reproduce, tabulate_results
+from wpdc_gwcs.reproduction.centroids import photon_limit
+from wpdc_gwcs.simulation import make_camera
+from wpdc_gwcs.simulation.light import PSF, SIGMA_PER_FWHM, add_gaussians
 
 SMALL = Scale(
     detectors=("NUV-1", "g-1"),
@@ -19,6 +22,9 @@ SMALL = Scale(
     n_bass=2,
     r0_bass=200.0,
     bass={"image_shape": (400, 420), "distortion": 4.0, "density": 100.0},
+    n_images=1,
+    n_cluster=2,
+    images={"image_shape": (512, 512), "distortion": 10.0, "density": 1500.0},
 )
 
 
@@ -55,6 +61,7 @@ def test_results_stand_beside_the_paper():
 
 def test_detectors(made):
     folder, results = made
+    results = results[results["part"] == "detectors"]
     for detector in SMALL.detectors:
         assert abs(value(results, detector, "mean_dx")) < 0.01
         assert 0.02 < value(results, detector, "sigma_dx") < 0.06
@@ -75,6 +82,7 @@ def test_detectors(made):
 
 def test_weights(made):
     folder, results = made
+    results = results[results["part"] == "weights"]
     # Within r0 the paper's weight follows the distortion best, over all of the detector it does
     # not: there the polynomial is an extrapolation.
     central = {w: value(results, f"{w} central", "d80_dx") for w in ("w1", "w2", "unweighted")}
@@ -91,6 +99,7 @@ def test_weights(made):
 
 def test_bass(made):
     folder, results = made
+    results = results[results["part"] == "bass"]
     assert value(results, "all", "sigma_alpha", "paper") == 5.494
     for item in ("all", "cubic"):
         # 454 mas to the pixel; centroids are good to 0.01 to 0.02 px.
@@ -102,6 +111,50 @@ def test_bass(made):
     assert len(list((folder / "bass").glob("sky-offsets-*.png"))) == 3
 
 
+def test_cluster(made):
+    folder, results = made
+    results = results[results["part"] == "cluster"]
+    assert value(results, "g-1", "sigma_dy", "paper") == 0.053
+    for quantity in ("sigma_dx", "sigma_dy"):
+        assert value(results, "g-1", quantity) < 0.03
+        assert value(results, "g-1", f"raw_{quantity}") >= value(results, "g-1", quantity)
+    assert {p.name for p in (folder / "cluster").iterdir()} > {
+        "residuals-ours.png", "residuals-literal.png", "magnitude-ours.png",
+    }  # fmt: skip
+
+
+def test_centroids_reach_the_photon_limit(made):
+    folder, results = made
+    results = results[results["part"] == "centroids"]
+    limit = value(results, "g = 25", "photon_limit")
+    n = value(results, "g = 25", "n_stars")
+    for quantity in ("sigma_dx", "sigma_dy"):
+        found = value(results, "g = 25", quantity)
+        assert found == pytest.approx(limit, rel=0.15 + 4 / np.sqrt(2 * n))
+        assert np.isnan(value(results, "g = 25", quantity, "literal"))
+    assert (folder / "centroids" / "centroids.png").stat().st_size > 10_000
+
+
+def test_photon_limit_against_an_image():
+    """The bound from the PSF that images are drawn with: two stars half a thousandth apart."""
+    camera = make_camera("csst-msc", image_shape=(64, 64), distortion=0.1)
+    detector = camera.detectors[0]
+    _, _, profile, slope = camera.psf_stamp()
+    assert profile.sum() == pytest.approx(1, abs=1e-6)
+    side = int(np.sqrt(profile.size))
+    images = np.zeros((2, side, side))
+    s = np.array([camera.fwhm * SIGMA_PER_FWHM])
+    for image, step in zip(images, (-5e-4, 5e-4), strict=True):
+        for share, width in PSF:
+            at = np.array([side // 2 + step]), np.array([side // 2 + 0.0])
+            add_gaussians(image, *at, np.array([share * 1e6]), width * s, width * s)
+    np.testing.assert_allclose(slope, np.ravel(images[1] - images[0]) / 1e-3 / 1e6, atol=2e-5)
+    flux = camera.flux(24.0, detector)
+    variance = flux * profile + camera.background + camera.read_noise**2
+    expected = 1 / np.sqrt(np.sum((flux * slope) ** 2 / variance))
+    assert photon_limit(camera, detector, np.array([24.0]))[0] == pytest.approx(expected)
+
+
 def test_one_table_for_all(made):
     folder, results = made
     written = Table.read(folder / "results.ecsv")
@@ -109,14 +162,14 @@ def test_one_table_for_all(made):
     np.testing.assert_allclose(written["ours"], results["ours"])
     with pytest.raises(InputError, match="results.ecsv: file exists"):
         reproduce(["weights"], folder, scale=SMALL)
-    with pytest.raises(InputError, match="part must be one of detectors, bass, .* got 'bass9'"):
+    with pytest.raises(InputError, match="part must be one of detectors, cluster, .* got 'bass9'"):
         reproduce(["bass9"], folder)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["all9"], "PART must be one of detectors, bass, weights or all, got 'all9'"),
+        (["all9"], "PART must be one of detectors, cluster, bass, weights, centroids or all, got"),
         (["all", "--jobs", "0"], "--jobs must be at least 1, got 0"),
         (["all", "--seed", "-1"], "--seed must be 0 or more, got -1"),
     ],

@@ -15,7 +15,11 @@ from wpdc_gwcs.exceptions import InputError
 @app.command("reproduce", no_args_is_help=True)
 def reproduce_command(
     part: Annotated[
-        str, typer.Argument(metavar="PART", help="detectors, bass, weights, or all of them: all.")
+        str,
+        typer.Argument(
+            metavar="PART",
+            help="detectors, cluster, bass, weights, centroids, or all of them: all.",
+        ),
     ],
     output: Annotated[
         Path, typer.Option("--output", metavar="DIR", help="Folder to write to; made if needed.")

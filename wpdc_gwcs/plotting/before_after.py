@@ -15,14 +15,20 @@ from wpdc_gwcs.plotting.arrows import draw_arrows
 
 __all__ = ["plot_before_after"]
 
-# Stars in the profiles: more would be a blot.
-_MOST_POINTS = 4000
 # Height of a profile as a share of the map, and gap between them, inches.
 _HEIGHT, _GAP = "22%", 0.08
 
 
 def plot_before_after(
-    before, after, *, image_shape, axes=None, n_bins=20, titles=("before", "after"), seed=0
+    before,
+    after,
+    *,
+    image_shape,
+    axes=None,
+    n_bins=20,
+    titles=("before", "after"),
+    n_points=4000,
+    seed=0,
 ):
     """Draw residuals before and after a calibration side by side.
 
@@ -41,8 +47,10 @@ def plot_before_after(
         Cells along each side of the detector.
     titles : (str, str), optional
         What stands over the two.
+    n_points : int, optional
+        Stars in the profiles, at most: more would be a blot.
     seed : int, optional
-        Of the choice of stars that are shown in the profiles, 4000 at most.
+        Of their choice.
 
     Returns
     -------
@@ -68,15 +76,17 @@ def plot_before_after(
     ny, nx = image_shape
     axes = given_axes(axes, 2, 11.0, 5.0 * min(ny / nx, 1.6) + 0.6)
     panels = zip(axes, (before, after), titles, strict=True)
-    return np.array([_draw_one(m, *pool(t), image_shape, n_bins, o, seed) for m, t, o in panels])
+    return np.array(
+        [_draw_one(m, *pool(t), image_shape, n_bins, o, n_points, seed) for m, t, o in panels]
+    )
 
 
-def _draw_one(main, x, y, dx, dy, image_shape, n_bins, title, seed):
+def _draw_one(main, x, y, dx, dy, image_shape, n_bins, title, n_points, seed):
     from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.axes_grid1 import make_axes_locatable
 
     arrows = draw_arrows(main, x, y, dx, dy, image_shape=image_shape, n_bins=n_bins)
-    chosen = np.random.default_rng(seed).permutation(len(x))[:_MOST_POINTS]
+    chosen = np.random.default_rng(seed).permutation(len(x))[:n_points]
     limit = symmetric_limit(dx, dy)
     style = {"ls": "none", "marker": ".", "ms": 2, "mew": 0, "alpha": 0.4, "rasterized": True}
     divider = make_axes_locatable(main)

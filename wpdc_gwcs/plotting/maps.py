@@ -14,24 +14,22 @@ __all__ = ["draw_maps", "plot_lookup_table"]
 def draw_maps(maps, extent, image_shape, *, level=99):
     """Draw maps beside each other.
 
-    The signed ones share a scale that is symmetric about zero and ends at a percentile, so that a
-    cell with one bad star does not hide the others.
-
     Parameters
     ----------
-    maps : sequence of (ndarray, str, bool)
-        Values ``(ny, nx)`` of each, the label of its scale, and whether they have a sign.
+    maps : list of (ndarray, str, bool)
+        Values, what they are, and whether they have a sign.
     extent : (float, float, float, float)
-        Left, right, lower and upper end in px.
+        Left, right, lower and upper edge of the maps, px.
     image_shape : (int, int)
-        Shape ``(ny, nx)`` of the detector.
+        Shape of what is drawn, ``(ny, nx)``.
     level : float, optional
-        Percentile of the absolute values at which the signed scale ends.
+        Percentile at which the scale of the signed ones ends.
 
     Returns
     -------
-    `~matplotlib.figure.Figure`
-        The figure.
+    `matplotlib.figure.Figure`
+        The signed ones share a scale that is symmetric about zero, so that a cell with one bad star
+        does not hide the others.
     """
     ny, nx = image_shape
     figure = new_figure(11.5, 11.5 / 3 * min(ny / nx, 1.6) + 1.1)

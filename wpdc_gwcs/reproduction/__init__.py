@@ -7,7 +7,9 @@ from astropy.table import vstack
 from wpdc_gwcs.exceptions import InputError
 from wpdc_gwcs.io import write_table
 from wpdc_gwcs.reproduction.bass import reproduce_bass
+from wpdc_gwcs.reproduction.centroids import reproduce_centroids
 from wpdc_gwcs.reproduction.claims import CLAIMS, Claim
+from wpdc_gwcs.reproduction.cluster import reproduce_cluster
 from wpdc_gwcs.reproduction.detectors import reproduce_detectors
 from wpdc_gwcs.reproduction.results import tabulate_results
 from wpdc_gwcs.reproduction.scale import FULL, QUICK, Scale
@@ -22,6 +24,8 @@ __all__ = [
     "Scale",
     "reproduce",
     "reproduce_bass",
+    "reproduce_centroids",
+    "reproduce_cluster",
     "reproduce_detectors",
     "reproduce_weights",
     "tabulate_results",
@@ -30,8 +34,10 @@ __all__ = [
 #: Name of a part to the function that makes it.
 PARTS = {
     "detectors": reproduce_detectors,
+    "cluster": reproduce_cluster,
     "bass": reproduce_bass,
     "weights": reproduce_weights,
+    "centroids": reproduce_centroids,
 }
 
 

@@ -35,6 +35,10 @@ class Scale:
         The same radius on its chips, px.
     bass : dict
         Options of the camera ``bass-90prime`` and of its field, empty for its own size.
+    n_images, n_cluster : int
+        Images whose centroids are measured, and images of the cluster.
+    images : dict
+        Options of the camera ``csst-msc`` and of its field for images, empty for its own size.
     """
 
     detectors: tuple[str, ...] = DETECTORS
@@ -46,6 +50,9 @@ class Scale:
     n_bass: int = 10
     r0_bass: float = 2000.0
     bass: dict = field(default_factory=dict)
+    n_images: int = 3
+    n_cluster: int = 18
+    images: dict = field(default_factory=dict)
 
     def fields(self, seed):
         """Choose where on the sky the fields are, and how rich.
@@ -81,4 +88,7 @@ QUICK = Scale(
     n_bass=3,
     r0_bass=250.0,
     bass={"image_shape": (512, 504), "distortion": 5.0, "density": 100.0},
+    n_images=1,
+    n_cluster=2,
+    images={"image_shape": (1026, 1024), "distortion": 22.0, "density": 600.0},
 )

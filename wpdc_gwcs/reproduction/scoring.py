@@ -11,7 +11,7 @@ CLOSE_PX = 0.01
 _MAS = 3.6e6  # per deg
 
 
-def score_run(simulation, run):
+def score_run(simulation, run, *, images=False):
     """Score the frames of a run.
 
     Parameters
@@ -20,6 +20,8 @@ def score_run(simulation, run):
         What the frames were simulated by.
     run : CalibrationRun
         Their calibration.
+    images : bool, optional
+        Whether sources were measured on images, so that they are not those of the lists.
 
     Returns
     -------
@@ -31,6 +33,8 @@ def score_run(simulation, run):
     for calibration in run.calibrations:
         stars = truths[calibration.frame].observe()[1]
         stars.rename_column("reference_index", "catalog_index")
+        if images:
+            stars.remove_column("source_index")
         scores.append(score_frame(calibration, truths[calibration.frame], stars, limit=CLOSE_PX))
     return scores
 

@@ -4,9 +4,10 @@ from dataclasses import dataclass, field, replace
 
 import astropy.units as u
 import numpy as np
+from scipy.special import ndtr
 
 from wpdc_gwcs.simulation.distortion import Distortion
-from wpdc_gwcs.simulation.light import SIGMA_PER_FWHM, find_zero_point
+from wpdc_gwcs.simulation.light import PSF, SIGMA_PER_FWHM, find_zero_point
 
 __all__ = ["SimulatedCamera", "SimulatedDetector"]
 
@@ -198,6 +199,30 @@ class SimulatedCamera:
         s = self.fwhm * SIGMA_PER_FWHM * (1 + self.psf_variation * (a * a + b * b) / 2)
         shape = self.psf_variation * (a - b) / 2
         return s * (1 + shape), s * (1 - shape)
+
+    def psf_stamp(self):
+        """Give the mean PSF on pixels, for a star in the middle of one.
+
+        Returns
+        -------
+        x, y : (N,) ndarray
+            Pixels, from the star.
+        profile : (N,) ndarray
+            Share of the star's light in each.
+        slope : (N,) ndarray
+            Its derivative by the star's place along x, per px.
+        """
+        half = int(np.ceil(6 * self.fwhm))
+        edges = np.arange(-half, half + 2) - 0.5
+        profile = slope = 0.0
+        for share, width in PSF:
+            s = width * self.fwhm * SIGMA_PER_FWHM
+            across = np.diff(ndtr(edges / s))
+            density = np.exp(-0.5 * (edges / s) ** 2) / (s * np.sqrt(2 * np.pi))
+            profile = profile + share * np.outer(across, across)
+            slope = slope - share * np.outer(across, np.diff(density))
+        y, x = np.mgrid[-half : half + 1, -half : half + 1]
+        return x.ravel(), y.ravel(), profile.ravel(), slope.ravel()
 
     def snr(self, flux):
         """Give the signal-to-noise ratio of stars under the PSF's noise-equivalent area.

@@ -15,7 +15,7 @@ _QUINTIC = 0.15
 
 # Distance from the axis, in half-widths, where a detector's own terms have the size that they have
 # for a single detector.
-_TERMS_AT = 3.2
+_TERMS_AT = 4.0
 
 # Rows of five, from the bottom up, and the four columns of the Main Survey Camera that have
 # imaging detectors, from left to right.  The rest of its 30 detectors are for spectra.
@@ -42,7 +42,7 @@ _CAMERA = {
     "csst-msc": {
         "image_shape": (9232, 9216),
         "distortion": 200.0,
-        "waves": 0.004,
+        "waves": 0.002,
         "pixel_scale": 0.074 * u.arcsec,
         "magnitudes": (17.0, 24.5),
         "limit_snr": 13.0,
@@ -184,7 +184,7 @@ def _with_optics(places, shape, distortion, waves, seed):
         x, y = np.subtract(axis, place["center"]) * place.get("axes", (1, 1)) / half
         one = Distortion.off_axis(shape, complex(x, y), quintic=quintic, rng=rng)
         # What is a detector's own grows towards the rim with what is common.
-        own = max(np.hypot(x, y), 1.0) / _TERMS_AT
+        own = (max(np.hypot(x, y), 1.0) / _TERMS_AT) ** 1.5
         drawn.append(replace(one, terms={key: own * c for key, c in one.terms.items()}))
     gain = distortion / max(one.greatest() for one in drawn)
     detectors = []

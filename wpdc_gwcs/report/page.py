@@ -1,0 +1,310 @@
+"""What stands on the page: pooled detectors, frames, settings."""
+
+from collections import Counter
+
+import numpy as np
+from astropy.table import Table, vstack
+
+from wpdc_gwcs.evaluation import evaluate
+from wpdc_gwcs.report.figures import detector_figures, frame_figures
+from wpdc_gwcs.report.template import PAGE
+
+__all__ = ["write_report"]
+
+# Columns of the summary that are seen at once, and how they are called there.
+_IMPORTANT = {
+    "frame": ("frame", None),
+    "detector": ("detector", None),
+    "status": ("status", None),
+    "n_matched": ("stars", "matched"),
+    "mean_dx": ("mean dx", "px"),
+    "mean_dy": ("mean dy", "px"),
+    "sigma_dx": ("sigma dx", "px"),
+    "sigma_dy": ("sigma dy", "px"),
+    "holdout_sigma_dx": ("held out dx", "sigma, px"),
+    "holdout_sigma_dy": ("held out dy", "sigma, px"),
+    "rms_mas": ("rms", "mas"),
+    "reason": ("reason", None),
+}
+_TEXTS = {"frame", "detector", "status", "reason", "camera", "exposure"}
+# Field of ResidualStatistics and heading of its column.
+_STATISTICS = {
+    "n": ("stars", None),
+    "mean_dx": ("mean dx", "px"),
+    "mean_dy": ("mean dy", "px"),
+    "sigma_dx": ("sigma dx", "px"),
+    "sigma_dy": ("sigma dy", "px"),
+    "scatter_dx": ("1.48 MAD dx", "px"),
+    "scatter_dy": ("1.48 MAD dy", "px"),
+    "d80_dx": ("d80 dx", "px"),
+    "d80_dy": ("d80 dy", "px"),
+}
+# Detectors with all their figures; of more, each has the most important one.
+_FEW_DETECTORS = 6
+# Characters of a column before its texts are broken.
+_WIDEST = 34
+_POOLED = ("x", "y", "dx", "dy", "used", "holdout", "phot_g_mean_mag", "snr")
+
+
+def write_report(summary, solutions, matches, file, *, title="Calibration report", about=None):
+    """Write a page with the detectors, pooled over their frames, then the frames one by one.
+
+    Parameters
+    ----------
+    summary : `~astropy.table.Table`
+        One row per frame, as in ``summary.ecsv``, with at least ``frame``, ``detector`` and
+        ``status``.
+    solutions : dict
+        Detector name to `DistortionSolution`.  Frames of other detectors have no map.
+    matches : dict
+        Frame name to match table (``x``, ``y``, ``dx``, ``dy``, ``used``, ``holdout``), of the
+        frames that were solved, whatever they lack.
+    file : text file object
+        Where the page goes.
+    title : str, optional
+        Heading of the page.
+    about : dict, optional
+        What the run was, heading to names and values, such as ``{"settings": {"degree": "auto"}}``;
+        the settings of the solutions if not given.
+
+    Notes
+    -----
+    Everything is in the one page: it can be mailed, and opened without a network.  Frames are
+    folded; 72 of them make less than 3 MB, of one detector or of 72.
+    """
+    from jinja2 import Environment
+
+    frames = {str(row["frame"]): str(row["detector"]) for row in summary}
+    pooled = {
+        name: _pool([matches[f] for f, d in frames.items() if d == name and f in matches])
+        for name in dict.fromkeys([*frames.values(), *solutions])
+    }
+    alone = Counter(frames.get(name) for name in matches)
+    ids = {f: f"frame-{k}" for k, f in enumerate(frames) if f in matches}
+    many = len(pooled) > _FEW_DETECTORS
+    sections = [
+        {
+            "id": f"detector-{k}",
+            "title": f"Detector {name}",
+            "text": _describe(solutions.get(name), table),
+            "figures": detector_figures(name, solutions.get(name), table, small=many),
+        }
+        for k, (name, table) in enumerate(pooled.items())
+        if name in solutions or table is not None
+    ]
+    page = Environment(autoescape=True).from_string(PAGE)
+    file.write(
+        page.render(
+            title=title,
+            counts=_counts(summary),
+            contents=_contents(sections, ids, about or solutions),
+            detectors=_detector_table(summary, pooled, sections),
+            sections=sections,
+            summary=_summary_table(summary, ids),
+            everything=_every_column(summary),
+            frames=[
+                {
+                    "id": ids[name],
+                    "title": name,
+                    "table": _frame_table(matches[name]),
+                    # What is shown of a detector is all that there is of its only frame.
+                    "figures": frame_figures(name, matches[name])
+                    if alone[frames[name]] > 1 or frames[name] not in solutions
+                    else [],
+                }
+                for name in ids
+            ],
+            settings=_settings(solutions, about),
+        )
+    )
+
+
+def _counts(summary):
+    states = [str(s) for s in summary["status"]]
+    parts = [f"{states.count(s)} {s}" for s in ("solved", "degraded", "failed") if states.count(s)]
+    return f"{len(states)} frame{'s' * (len(states) != 1)}: {', '.join(parts)}."
+
+
+def _contents(sections, ids, about):
+    entries = [{"id": "detectors", "title": "Detectors"}, *sections]
+    entries.append({"id": "frames", "title": "Frames"})
+    if ids:
+        entries.append({"id": "each", "title": "Frame by frame"})
+    if about:
+        entries.append({"id": "settings", "title": "Settings"})
+    return entries
+
+
+def _pool(tables):
+    """Give the matches of all frames of a detector in one table, or `None`."""
+    plain = []
+    for table in tables:
+        columns = [name for name in _POOLED if name in table.colnames]
+        plain.append(Table({n: np.asarray(getattr(table[n], "value", table[n])) for n in columns}))
+    # Magnitudes are shown where all frames have them.
+    return vstack(plain, join_type="inner", metadata_conflicts="silent") if plain else None
+
+
+def _masks(table):
+    names = table.colnames
+    n = len(table)
+    holdout = np.asarray(table["holdout"], bool) if "holdout" in names else np.zeros(n, bool)
+    used = np.asarray(table["used"], bool) if "used" in names else ~holdout
+    return used & ~holdout, holdout
+
+
+def _statistics(table, chosen):
+    residuals = (np.asarray(getattr(table[n], "value", table[n]))[chosen] for n in ("dx", "dy"))
+    return evaluate(*residuals)
+
+
+def _columns(pairs, texts=()):
+    return [{"name": n, "unit": u, "text": n in texts} for n, u in pairs]
+
+
+def _detector_table(summary, pooled, sections):
+    links = {s["title"].removeprefix("Detector "): s["id"] for s in sections}
+    headings = [
+        ("detector", None), ("frames", None), ("solved", None), ("degraded", None),
+        ("failed", None), *(_STATISTICS[n] for n in list(_STATISTICS)[:5]),
+        ("held out dx", "sigma, px"), ("held out dy", "sigma, px"), ("rms", "mas"),
+    ]  # fmt: skip
+    rows = []
+    for name, table in pooled.items():
+        mine = summary[[str(d) == name for d in summary["detector"]]]
+        states = [str(s) for s in mine["status"]]
+        fit = held = None
+        if table is not None:
+            used, holdout = _masks(table)
+            fit, held = _statistics(table, used), _statistics(table, holdout)
+        cells = [name, len(mine), *(states.count(s) for s in ("solved", "degraded", "failed"))]
+        cells += [getattr(fit, n, np.nan) for n in list(_STATISTICS)[:5]]
+        cells += [getattr(held, n, np.nan) for n in ("sigma_dx", "sigma_dy")]
+        cells.append(_median(mine, "rms_mas"))
+        rows.append(
+            {"cells": [*map(_cell, cells[:-1]), _cell(cells[-1], 2)], "link": links.get(name)}
+        )
+    return _without_empty({"columns": _columns(headings, _TEXTS), "rows": rows})
+
+
+def _median(table, name):
+    if name not in table.colnames or len(table) == 0:
+        return np.nan
+    values = np.ma.filled(np.ma.asarray(getattr(table[name], "value", table[name]), float), np.nan)
+    return float(np.nanmedian(values)) if np.isfinite(values).any() else np.nan
+
+
+def _summary_table(summary, ids):
+    names = [name for name in _IMPORTANT if name in summary.colnames]
+    table = {
+        "columns": _columns([_IMPORTANT[n] for n in names], _TEXTS),
+        "rows": [
+            {
+                "status": str(row["status"]),
+                "link": ids.get(str(row["frame"])),
+                "cells": [_cell(row[n], 2 if n == "rms_mas" else 4) for n in names],
+            }
+            for row in summary
+        ],
+    }
+    return _without_empty(table)
+
+
+def _every_column(summary):
+    return {
+        "columns": [
+            {"name": n, "unit": str(summary[n].unit or ""), "text": n in _TEXTS}
+            if hasattr(summary[n], "unit")
+            else {"name": n, "unit": None, "text": n in _TEXTS}
+            for n in summary.colnames
+        ],
+        "rows": [
+            {"status": str(row["status"]), "cells": [_cell(row[n]) for n in summary.colnames]}
+            for row in summary
+        ],
+    }
+
+
+def _without_empty(table):
+    """Leave out columns in which no row has anything: nothing was held out, nothing has failed."""
+    kept = [
+        k
+        for k in range(len(table["columns"]))
+        if k == 0 or any(row["cells"][k] not in ("", "0") for row in table["rows"])
+    ]
+    columns = [
+        {**table["columns"][k], "width": _width(table, k)}
+        if table["columns"][k]["text"]
+        else table["columns"][k]
+        for k in kept
+    ]
+    rows = [{**row, "cells": [row["cells"][k] for k in kept]} for row in table["rows"]]
+    return {"columns": columns, "rows": rows}
+
+
+def _width(table, k):
+    """Least width of a column of texts, in characters: names are whole, sentences are broken."""
+    cells = [table["columns"][k]["name"], *(row["cells"][k] for row in table["rows"])]
+    return min(max(map(len, cells)) + 1, _WIDEST)
+
+
+def _frame_table(table):
+    rows = []
+    for label, chosen in zip(("in the fit", "held out"), _masks(table), strict=True):
+        if chosen.any():
+            found = _statistics(table, chosen)
+            rows.append({"cells": [label, *(_cell(getattr(found, n)) for n in _STATISTICS)]})
+    headings = [("", None), *_STATISTICS.values()]
+    return {"columns": _columns(headings, _TEXTS), "rows": rows}
+
+
+def _describe(solution, table):
+    """Say in a few words what the solution of a detector is."""
+    if solution is None:
+        return "No solution of it is at hand."
+    ny, nx = solution.image_shape
+    text = f"{nx} x {ny} px"
+    if "n_used" in solution.statistics:
+        stars, exposures = (solution.statistics[name] for name in ("n_used", "n_exposures"))
+        text += f"; {stars} residuals of {exposures} exposure{'s' * (exposures != 1)}"
+    if solution.settings.get("method") == "paper":
+        text += ", by the paper's literal method"
+    if solution.valid_from is not None or solution.valid_to is not None:
+        text += f"; valid {solution.validity}"
+    lookup = solution.lookup_table
+    if lookup is None:
+        return f"{text}; no look-up table."
+    size = np.hypot(lookup.dx, lookup.dy)
+    return (
+        f"{text}; look-up table of {len(lookup.x_grid)} x {len(lookup.y_grid)} nodes, "
+        f"{np.sqrt(np.mean(size**2)):.3g} px rms, {size.max():.3g} px at most."
+    )
+
+
+def _settings(solutions, about):
+    """Tables of names and values."""
+    if about is None:
+        about = {f"detector {name}": s.settings for name, s in solutions.items() if s.settings}
+    return [
+        {
+            "columns": [{"name": heading, "text": True}, {"name": "", "text": True}],
+            "rows": [{"cells": [str(k), _plain(v)]} for k, v in values.items()],
+        }
+        for heading, values in about.items()
+        if values
+    ]
+
+
+def _plain(value):
+    if isinstance(value, (list, tuple)):
+        return ", ".join(map(str, value))
+    return "none" if value is None else str(value)
+
+
+def _cell(value, digits=4):
+    if np.ma.is_masked(value):
+        return ""
+    value = getattr(value, "value", value)
+    if isinstance(value, float | np.floating):
+        return f"{value:.{digits}f}" if np.isfinite(value) else ""
+    return str(value)

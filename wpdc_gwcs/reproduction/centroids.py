@@ -1,0 +1,146 @@
+"""Centroids of a rendered image against magnitude, with the photon limit: figure 2.
+
+::
+
+    simulate --images--> measure_sources --nearest true star--> residuals, in bins of 0.5 mag
+"""
+
+import numpy as np
+from astropy.table import Table
+from scipy.spatial import cKDTree
+
+from wpdc_gwcs.calibration import measure_sources
+from wpdc_gwcs.evaluation import evaluate
+from wpdc_gwcs.plotting import plot_centroids
+from wpdc_gwcs.reproduction.results import tabulate_results
+from wpdc_gwcs.simulation import simulate
+
+__all__ = ["measure_against_truth", "photon_limit", "reproduce_centroids"]
+
+_DETECTOR = "g-1"
+# The paper's stars reach beyond 25 mag.
+_MAGNITUDES = (17.0, 25.5)
+# What the paper gives numbers of.
+_BINS = {"g < 20": (-np.inf, 20.0), "g = 25": (24.75, 25.25)}
+# A source is a star that is this near, px, and that has no other star within the second distance,
+# which light from there would move.
+_NEAR_PX, _ALONE_PX = 1.0, 12.0
+
+
+def measure_against_truth(exposure):
+    """Measure the stars of a rendered image and hold them against the truth.
+
+    Parameters
+    ----------
+    exposure : SimulatedExposure
+        The exposure; its image is rendered.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        One row for each clean source that is a star on its own: ``x``, ``y``, ``dx``, ``dy``
+        (measured less true), ``x_err``, ``y_err`` in px, ``snr`` and ``magnitude``.
+    """
+    sources = measure_sources(exposure.frame(image=True))
+    sources = sources[np.asarray(sources["flags"]) == 0]
+    stars = exposure.observe()[1]
+    x, y = (np.asarray(sources[name], float) for name in ("x", "y"))
+    tree = cKDTree(np.column_stack([stars["x"], stars["y"]]))
+    distance, star = tree.query(np.column_stack([x, y]))
+    apart = tree.query(tree.data, k=2)[0][:, 1]
+    chosen = np.flatnonzero((distance < _NEAR_PX) & (apart[star] > _ALONE_PX))
+    true = stars[star[chosen]]
+    found = Table({name: np.asarray(sources[name], float)[chosen] for name in ("x_err", "y_err")})
+    found["x"], found["y"] = true["x"], true["y"]
+    found["dx"], found["dy"] = x[chosen] - true["x"], y[chosen] - true["y"]
+    found["magnitude"] = true["magnitude"]
+    return found
+
+
+def reproduce_centroids(folder, scale, *, seed=1, jobs=1, progress=None):
+    """Reproduce the paper's centroid residuals against magnitude.
+
+    Parameters
+    ----------
+    folder : Path
+        Where figures go; it must exist.
+    scale : Scale
+        How large it is.
+    seed : int, optional
+        Of the camera and of the field.
+    jobs : int, optional
+        Not used: images are measured one by one.
+    progress : callable, optional
+        Called as ``progress("centroids", done, total)``.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        See `~wpdc_gwcs.reproduction.results.tabulate_results`.  The paper's method has centroids of
+        PSF fits, too: there is no number of its own for ``literal``.
+
+    Notes
+    -----
+    Writes ``centroids.png``.
+    """
+    options = {"density": 60.0, "galaxies": 10.0, **scale.images}
+    simulation = simulate(
+        scale.n_images,
+        camera="csst-msc",
+        detectors=[_DETECTOR],
+        seed=seed,
+        magnitudes=_MAGNITUDES,
+        **options,
+    )
+    tables = []
+    for done, exposure in enumerate(simulation.exposures):
+        tables.append(measure_against_truth(exposure))
+        if progress is not None:
+            progress("centroids", done + 1, len(simulation.exposures))
+    dx, dy, magnitude = (
+        np.concatenate([np.asarray(t[name]) for t in tables]) for name in ("dx", "dy", "magnitude")
+    )
+    camera, (detector,) = simulation.camera, simulation.camera.detectors
+    bright = np.linspace(magnitude.min(), magnitude.max(), 100)
+    limit = photon_limit(camera, detector, bright)
+    axes = plot_centroids(tables, limit=(bright, limit))
+    axes[0].figure.savefig(folder / "centroids.png", dpi=110)
+    found = {}
+    for item, (low, high) in _BINS.items():
+        inside = (magnitude > low) & (magnitude < high)
+        s = evaluate(dx[inside], dy[inside])
+        at = magnitude[inside]
+        numbers = {
+            ("mean_dx", "pix"): s.mean_dx,
+            ("sigma_dx", "pix"): s.sigma_dx,
+            ("mean_dy", "pix"): s.mean_dy,
+            ("sigma_dy", "pix"): s.sigma_dy,
+            ("photon_limit", "pix"): np.median(photon_limit(camera, detector, at)),
+            ("n_stars", ""): s.n,
+        }
+        found |= {(item, *key): (np.nan, number) for key, number in numbers.items()}
+    return tabulate_results("centroids", found)
+
+
+def photon_limit(camera, detector, magnitude):
+    """Give the centroid error that photons, sky and read noise leave.
+
+    Parameters
+    ----------
+    camera : SimulatedCamera
+        The camera.
+    detector : SimulatedDetector
+        The detector.
+    magnitude : (N,) ndarray
+        Magnitudes of stars.
+
+    Returns
+    -------
+    (N,) ndarray
+        Errors along one axis, px: the Cramer-Rao bound of the mean PSF on pixels, for a star in
+        the middle of one.
+    """
+    _, _, profile, slope = camera.psf_stamp()
+    flux = camera.flux(magnitude, detector)[:, None]
+    variance = flux * profile + camera.background + camera.read_noise**2
+    return 1 / np.sqrt(np.sum((flux * slope) ** 2 / variance, axis=1))
