@@ -5,28 +5,28 @@ caller's back.  The figures of one frame return a new `matplotlib.figure.Figure`
 ``figure.savefig(path)`` writes it.  Those of the paper, of a detector or a whole camera, draw into
 the ``axes`` that they are given, or into new ones, and return them; ``axes.figure`` is the figure.
 
-============================  ======================================================================
-of a frame                    shows
-============================  ======================================================================
-`plot_residual_arrows`        mean residuals as arrows
-`plot_residual_maps`          mean residuals and numbers of stars as maps
-`plot_residuals_vs_position`  residuals against x and y
-`plot_residuals_vs_magnitude` residuals and their scatter against magnitude
-`plot_cdf`                    cumulative distributions
-`plot_lookup_table`           a look-up table
-============================  ======================================================================
+==============================  ====================================================================
+of a frame                      shows
+==============================  ====================================================================
+`plot_residual_arrows`          mean residuals as arrows
+`plot_residual_maps`            mean residuals and numbers of stars as maps
+`plot_residuals_vs_position`    residuals against x and y
+`plot_residuals_vs_magnitude`   residuals and their scatter against magnitude
+`plot_cdf`                      cumulative distributions
+`plot_lookup_table`             a look-up table
+==============================  ====================================================================
 
-============================  ======================================================================
-of a detector or a camera     shows
-============================  ======================================================================
-`plot_focal_plane`            the distortion of all detectors where they stand
-`plot_before_after`           residuals before and after the calibration, with their profiles
-`plot_slices`                 mean residuals in slices of the detector, several solutions together
-`plot_weights`                distributions with each of the radial weights
-`plot_magnitude`              residuals against magnitude, pooled
-`plot_centroids`              centroid errors against magnitude, and the photon limit
-`plot_sky_offsets`            offsets on the sky with histograms and Gaussian fits
-============================  ======================================================================
+==============================  ====================================================================
+of a detector or a camera       shows
+==============================  ====================================================================
+`plot_focal_plane`              the distortion of all detectors where they stand
+`plot_before_after`             residuals before and after the calibration, with their profiles
+`plot_slices`                   mean residuals in slices of the detector, several solutions together
+`plot_weights`                  distributions with each of the radial weights
+`plot_magnitude`                residuals against magnitude, pooled
+`plot_centroids`                centroid errors against magnitude, and the photon limit
+`plot_sky_offsets`              offsets on the sky with histograms and Gaussian fits
+==============================  ====================================================================
 """
 
 from wpdc_gwcs.plotting.before_after import plot_before_after
