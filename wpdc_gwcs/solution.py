@@ -111,6 +111,11 @@ class DistortionSolution(InMemory):
             if epoch is not None and not np.isfinite(epoch):
                 raise ValueError(f"{name} must be a Julian year or None, got {epoch}")
 
+    def _repr_html_(self):
+        from wpdc_gwcs.description import as_html
+
+        return as_html(self)
+
     def holds_at(self, epoch):
         """Tell whether the solution is valid at an epoch.
 
@@ -282,6 +287,11 @@ class Calibration(InMemory):
         _freeze_sigma(self, "sigma")
         frozen_array(self, "color_shift", shape=(2, 3))
         freeze_attributes(self, "statistics", "settings", "provenance")
+
+    def _repr_html_(self):
+        from wpdc_gwcs.description import as_html
+
+        return as_html(self)
 
     def __getstate__(self):
         # Functions of compiled code stay where they are; they are made again where they are needed.
