@@ -69,6 +69,11 @@ class Camera:
         if self.reference not in self.detectors:
             raise ValueError(f"reference must be one of the detectors, got {self.reference!r}")
 
+    def _repr_html_(self):
+        from wpdc_gwcs.description import as_html
+
+        return as_html(self)
+
     def focal_plane(self, detector, x, y):
         """Focal plane position of pixels of a detector.
 

@@ -117,6 +117,11 @@ class DistortionSolution(InMemory):
         self.__dict__.update(state)
         freeze_models(self, "pv", "lookup_table")
 
+    def _repr_html_(self):
+        from wpdc_gwcs.description import as_html
+
+        return as_html(self)
+
     def holds_at(self, epoch):
         """Tell whether the solution is valid at an epoch.
 
@@ -289,6 +294,11 @@ class Calibration(InMemory):
         frozen_array(self, "color_shift", shape=(2, 3))
         freeze_attributes(self, "statistics", "settings", "provenance")
         freeze_models(self, "field")
+
+    def _repr_html_(self):
+        from wpdc_gwcs.description import as_html
+
+        return as_html(self)
 
     def __getstate__(self):
         # Functions of compiled code stay where they are; they are made again where they are needed.

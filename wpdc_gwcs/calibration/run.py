@@ -84,6 +84,11 @@ class CalibrationRun:
         names = ("calibrations", "solutions", "failures", "superseded", "cameras", "resumed")
         freeze_attributes(self, *names)
 
+    def _repr_html_(self):
+        from wpdc_gwcs.description import as_html
+
+        return as_html(self)
+
 
 @one_blas_thread
 def calibrate(

@@ -10,6 +10,7 @@ from wpdc_gwcs.cli import (  # noqa: F401
     files,
     report,
     reproduce,
+    show,
     simulate,
     stages,
 )

@@ -25,7 +25,6 @@ app = typer.Typer(
     name="wpdc",
     help="Calibrate wide-field frames: image + Gaia in, trustworthy WCS with distortion out.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shlex
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
@@ -36,7 +37,7 @@ from wpdc_gwcs.cli.options import (
 )
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.cli.report import write_page
-from wpdc_gwcs.exceptions import InputError, InternalError
+from wpdc_gwcs.exceptions import FrameFailure, InputError, InternalError
 
 log = logging.getLogger("wpdc_gwcs.cli")
 
@@ -336,6 +337,10 @@ def calibrate_command(
     for name, error in run.failures.items():
         details = f" (details in {output / ERRORS})" if isinstance(error, InternalError) else ""
         log.error("%s: not solved: %s%s", name, error, details)
+    refused = [f.source for f in loaded if isinstance(run.failures.get(f.name), FrameFailure)]
+    if refused and not quiet:
+        given = f"{shlex.quote(refused[0])} --catalog {shlex.quote(catalog)}"
+        typer.echo(f"stage by stage, and what to try: wpdc explain {given} --output why.png")
     if any(isinstance(error, InputError) for error in run.failures.values()):
         raise typer.Exit(2)
     if run.failures:

@@ -154,7 +154,7 @@ def info_command(
     stars = stars[inside(stars)]
     if len(stars) == 0:
         raise InputError(f"{catalog}: has no star in this part of the sky")
-    for label, text in _about(stars):
+    for label, text in lines_about(stars):
         typer.echo(f"{label:<12}{text}")
     typer.echo("\n   mag      stars  per sq. deg  with motion  error mas")
     from wpdc_gwcs.catalogs.overview import count_by_magnitude
@@ -167,8 +167,19 @@ def info_command(
         )
 
 
-def _about(stars):
-    """Lines about a catalog: a label and a text each."""
+def lines_about(stars):
+    """Tell what a catalog has.
+
+    Parameters
+    ----------
+    stars : `~astropy.table.Table`
+        As returned by `read_catalog`.
+
+    Yields
+    ------
+    label, text : str
+        A line.
+    """
     from wpdc_gwcs.catalogs.overview import sky_area
     from wpdc_gwcs.columns import numbers_or_nan
 

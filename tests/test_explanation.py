@@ -1,0 +1,175 @@
+"""What `wpdc explain` and `wpdc show` say, and how results show themselves in a notebook."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from wpdc_gwcs import calibrate, simulate, write
+from wpdc_gwcs.cli.app import run
+from wpdc_gwcs.description import as_html, describe
+from wpdc_gwcs.explanation import explain_frame
+from wpdc_gwcs.pictures import draw_explanation
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return simulate(1, image_shape=(512, 512), density=60.0, distortion=5.0, seed=3)
+
+
+@pytest.fixture(scope="module")
+def solved(sky):
+    return calibrate(sky.exposures[0].frame(), sky.reference)
+
+
+def turned(frame, degrees):
+    wcs = frame.wcs.deepcopy()
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    wcs.wcs.cd = wcs.wcs.cd @ [[c, -s], [s, c]]
+    return replace(frame, wcs=wcs)
+
+
+def test_a_frame_that_is_solved(sky, solved):
+    told = explain_frame(sky.exposures[0].frame(), sky.reference)
+    assert told.status == "solved"
+    assert [s.name for s in told.stages] == ["frame", "sources", "catalog", "match", "solution"]
+    assert all(stage.went_well for stage in told.stages)
+    assert not told.advice
+    # It is the same solution as that of a run.
+    same = solved.calibrations[0]
+    np.testing.assert_allclose(told.calibration.wcs(9.0, 9.0), same.wcs(9.0, 9.0), rtol=1e-12)
+    assert f"{same.statistics['n_used']} of" in told.stages[-1].lines[0]
+    figure = draw_explanation(told)
+    assert [axes.has_data() for axes in figure.axes] == [True] * 4
+
+
+def test_a_turned_frame_is_found_out_by_a_blind_search(sky):
+    frame = turned(sky.exposures[0].frame(), 90.0)
+    told = explain_frame(frame, sky.reference)
+    assert told.status == "failed"
+    assert [s.name for s in told.stages if not s.went_well] == ["match"]
+    advice = " ".join(told.advice)
+    assert "it matches with --blind" in advice
+    assert "90.0 deg" in advice
+    figure = draw_explanation(told)
+    assert "no solution: ends with the match" in figure.axes[3].texts[0].get_text()
+
+
+def test_a_catalog_of_another_sky(sky):
+    reference = Table(sky.reference)
+    reference["dec"] = np.asarray(reference["dec"]) - 20
+    told = explain_frame(sky.exposures[0].frame(), reference)
+    assert told.status == "failed"
+    assert told.stages[-1].name == "catalog"
+    assert "no star within" in told.reasons[0]
+    assert "wpdc catalog prepare gaia --around" in told.advice[0]
+    draw_explanation(told)
+
+
+def test_a_frame_without_an_epoch_and_one_without_stars(sky):
+    frame = sky.exposures[0].frame()
+    told = explain_frame(replace(frame, epoch=None), sky.reference)
+    assert told.status == "degraded"
+    assert any("--epoch" in advice for advice in told.advice)
+    few = frame.load_sources()[:5]
+    told = explain_frame(replace(frame, load_sources=lambda: few), sky.reference)
+    assert told.status == "failed"
+    assert "5 of 5 take part" in told.stages[1].lines[0]
+    empty = replace(frame, load_sources=lambda: few[:0])
+    told = explain_frame(empty, sky.reference)
+    assert [s.name for s in told.stages] == ["frame", "sources"]
+    assert told.sources is None
+    draw_explanation(told)
+
+
+def test_a_frame_of_no_place(sky):
+    class Nowhere:
+        def pixel_to_world_values(self, x, y):
+            return np.full(np.shape(x), np.nan), np.full(np.shape(x), np.nan)
+
+    told = explain_frame(replace(sky.exposures[0].frame(), wcs=Nowhere()), sky.reference)
+    assert told.status == "failed"
+    assert "--wcs" in told.advice[0]
+
+
+def test_results_in_a_notebook(solved):
+    calibration, solution = solved.calibrations[0], solved.solutions["sim"]
+    for result in (calibration, solution, solved):
+        html = result._repr_html_()
+        assert html == as_html(result)
+        assert html.startswith("<table><caption>")
+    lines = dict(describe(calibration))
+    assert lines["frame"] == "sim-01, solved"
+    assert f"{calibration.statistics['n_used']} of" in lines["stars"]
+    x, y = np.meshgrid(np.linspace(0, 511, 21), np.linspace(0, 511, 21))
+    u, v = solution.undistort(x.ravel(), y.ravel())
+    most = np.hypot(u - x.ravel(), v - y.ravel()).max()
+    assert f"up to {most:.2f} px" in dict(describe(solution))["distortion"]
+    assert "<b>" not in as_html(replace(calibration, frame="<b>"))
+    with pytest.raises(TypeError, match="cannot describe a int"):
+        describe(3)
+
+
+@pytest.mark.parametrize("angle", [0.0, 30.0, 150.0])
+def test_north_is_where_it_is(solved, angle):
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    # A sky seen from within, whose North is turned counterclockwise from the y axis.
+    cd = np.diag([-1e-4, 1e-4]) @ [[c, s], [-s, c]]
+    text = dict(describe(replace(solved.calibrations[0], cd=cd)))["scale"]
+    assert f"North {angle:.3f} deg from the y axis" in text
+    assert "0.36 arcsec" in text
+
+
+@pytest.fixture(scope="module")
+def folder(sky, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results")
+    frame = replace(sky.exposures[0].frame(), name="good")
+    bad = replace(frame, name="bad", load_sources=lambda: frame.load_sources()[:4])
+    calibrate([frame, bad], sky.reference, output=folder)
+    Table(sky.reference).write(folder / "gaia.fits")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        (".", ["frames      2", "solved      1", "bad         failed: ", "good.wcs.asdf"]),
+        ("summary.ecsv", ["frames      2", "failed      1"]),
+        ("good.wcs.asdf", ["frame       good, solved", "distortion  up to"]),
+        ("sim.solution.asdf", ["detector    sim, 512 x 512 px"]),
+        ("good.matches.ecsv", ["pairs       ", "residuals   0.0"]),
+        ("gaia.fits", ["stars       ", "epoch       2016", "lacks       ruwe"]),
+    ],
+)
+def test_show_tells_what_is_in_a_file(folder, tmp_path, capsys, name, words):
+    picture = tmp_path / "a.png"
+    assert run(["show", str(folder / name), "--output", str(picture)]) == 0
+    text = capsys.readouterr().out
+    for word in words:
+        assert word in text
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_show_an_exported_file(folder, tmp_path, capsys):
+    from wpdc_gwcs import read
+
+    write(read(folder / "good.wcs.asdf"), tmp_path / "a.head", format="head")
+    assert run(["show", str(tmp_path / "a.head")]) == 0
+    assert "distortion  up to" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.fits"], "nowhere.fits"),
+        (["{folder}/good.wcs.asdf", "--output", "a.gif"], "must end with .png"),
+        (["{folder}/.."], "has no summary.ecsv"),
+        (["{folder}/manifest.json"], "manifest.json"),
+    ],
+)
+def test_what_cannot_be_shown(folder, capsys, arguments, message):
+    assert run(["show", *(a.format(folder=folder) for a in arguments)]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1

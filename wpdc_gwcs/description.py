@@ -1,0 +1,160 @@
+"""Results in words: lines of a label and a text, for terminals and notebooks."""
+
+from html import escape
+
+import numpy as np
+
+__all__ = ["as_html", "describe"]
+
+
+def describe(result):
+    """Describe a result.
+
+    Parameters
+    ----------
+    result : Calibration, DistortionSolution, Camera or CalibrationRun
+        What is to be described.
+
+    Returns
+    -------
+    list of (str, str)
+        Labels and texts.
+
+    Raises
+    ------
+    TypeError
+        If it is something else.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import calibrate, simulate
+    >>> from wpdc_gwcs.description import describe
+    >>> sky = simulate(1, image_shape=(512, 512), density=60.0, distortion=5.0)
+    >>> run = calibrate(sky.exposures[0].frame(), sky.reference)
+    >>> describe(run.calibrations[0])[0]
+    ('frame', 'sim-01, solved')
+    """
+    if hasattr(result, "calibrations"):
+        return _of_run(result)
+    if hasattr(result, "solutions"):
+        return _of_camera(result)
+    if hasattr(result, "solution"):
+        return _of_calibration(result)
+    if hasattr(result, "pv"):
+        return _of_solution(result)
+    raise TypeError(f"cannot describe a {type(result).__name__}")
+
+
+def as_html(result):
+    """Write a description as the table that a notebook shows.
+
+    Parameters
+    ----------
+    result : object
+        What `describe` takes.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
+    rows = "".join(
+        f"<tr><th style='text-align:left'>{escape(label)}</th>"
+        f"<td style='text-align:left'>{escape(text)}</td></tr>"
+        for label, text in describe(result)
+    )
+    return f"<table><caption>{type(result).__name__}</caption>{rows}</table>"
+
+
+def _of_calibration(calibration):
+    statistics = calibration.statistics
+    status = statistics.get("status")
+    lines = [("frame", calibration.frame + (f", {status}" if status else ""))]
+    lines += [("lacks", reason) for reason in statistics.get("reasons", ())]
+    ra, dec = calibration.crval
+    lines.append(("pointing", f"RA {ra:.6f}, Dec {dec:.6f} deg at the reference point"))
+    lines.append(("scale", _scale(calibration.cd)))
+    if "n_used" in statistics:
+        lines.append(
+            (
+                "stars",
+                f"{statistics['n_used']} of {statistics['n_matched']} matched ones used, "
+                f"{statistics['n_sources']} sources",
+            )
+        )
+    residuals = statistics.get("residuals", {})
+    if "sigma_dx" in residuals:
+        lines.append(
+            (
+                "residuals",
+                f"{residuals['sigma_dx']:.4f} and {residuals['sigma_dy']:.4f} px in x and y, "
+                f"{statistics['rms_mas']:.2f} mas",
+            )
+        )
+    held = statistics.get("holdout", {})
+    if "sigma_dx" in held:
+        text = f"{held['sigma_dx']:.4f} and {held['sigma_dy']:.4f} px"
+        lines.append(("held out", text))
+    if calibration.sigma is not None:
+        sigma = np.hypot(calibration.sigma[0], calibration.sigma[1])
+        text = f"map known to {np.median(sigma):.4f} px, {np.max(sigma):.4f} px at worst"
+        lines.append(("certain", text))
+    if calibration.field is not None:
+        lines.append(("field", "a smooth field of this exposure (atmosphere)"))
+    if calibration.color_shift is not None:
+        lines.append(("color", f"for stars of color {calibration.reference_color:.2f}"))
+    return [*lines, *_of_solution(calibration.solution)]
+
+
+def _of_solution(solution):
+    shape = solution.image_shape
+    size = "" if shape is None else f", {shape[1]} x {shape[0]} px"
+    lines = [("detector", f"{solution.detector}{size}")]
+    if shape is not None:
+        x, y = np.meshgrid(np.linspace(0, shape[1] - 1, 21), np.linspace(0, shape[0] - 1, 21))
+        u, v = solution.undistort(x.ravel(), y.ravel())
+        shift = np.hypot(u - x.ravel(), v - y.ravel())
+        table = "" if solution.lookup_table is None else " and a table of what it leaves"
+        lines.append(
+            (
+                "distortion",
+                f"up to {np.nanmax(shift):.2f} px: a polynomial of degree {solution.pv.degree}"
+                f"{table}",
+            )
+        )
+    lines.append(("valid", solution.validity))
+    inputs = solution.provenance.get("inputs") or ()
+    if len(inputs):
+        lines.append(("made of", f"{len(inputs)} frames, {solution.provenance.get('created')}"))
+    return lines
+
+
+def _of_camera(camera):
+    lines = [("camera", f"{camera.name}, {len(camera.detectors)} detectors")]
+    lines.append(("reference", f"{camera.reference}, {_scale(camera.cd)}"))
+    for name, solution in camera.solutions.items():
+        lines.append((name, dict(_of_solution(solution)).get("distortion", "")))
+    return lines
+
+
+def _of_run(run):
+    states = [str(status) for status in run.summary["status"]]
+    counts = ", ".join(f"{states.count(s)} {s}" for s in dict.fromkeys(states))
+    lines = [("run", f"{run.run_id}: {len(states)} frames, {counts}")]
+    for row in run.summary:
+        sigma = np.hypot(float(row["sigma_dx"].value), float(row["sigma_dy"].value)) / np.sqrt(2)
+        good = f"{row['n_matched']} stars, {sigma:.4f} px, {float(row['rms_mas'].value):.2f} mas"
+        reason = str(row["reason"])
+        parts = [str(row["status"]), good if row["n_matched"] else "", reason]
+        lines.append((str(row["frame"]), "; ".join(part for part in parts if part)))
+    for name, solution in run.solutions.items():
+        lines.append((name, dict(_of_solution(solution)).get("distortion", "")))
+    return lines
+
+
+def _scale(cd):
+    scale = np.sqrt(abs(np.linalg.det(cd))) * 3600
+    x, y = np.linalg.solve(cd, [0.0, 1.0])
+    north = np.degrees(np.arctan2(-x, y))
+    mirrored = "" if np.linalg.det(cd) < 0 else ", mirrored"
+    return f"{scale:.6g} arcsec / px, North {north:.3f} deg from the y axis{mirrored}"

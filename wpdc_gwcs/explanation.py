@@ -1,0 +1,306 @@
+"""Why a frame is solved, degraded or refused: every stage of it, with counts.
+
+::
+
+    frame --> sources --> catalog --> match --> solution
+              each a Stage: how it went, in words; the first that fails ends it
+"""
+
+import shlex
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from wpdc_gwcs.calibration.camera import solve_camera
+from wpdc_gwcs.calibration.matched import (
+    MatchedFrame,
+    match_frame,
+    reference_in_reach,
+    sky_of_frame,
+    with_errors,
+)
+from wpdc_gwcs.calibration.measure import measure_sources, rules_of
+from wpdc_gwcs.calibration.settings import Settings
+from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs, sky_of
+from wpdc_gwcs.catalogs import Region, catalog_source, fill_motions, read_catalog
+from wpdc_gwcs.exceptions import MatchError, WPDCError
+from wpdc_gwcs.selection import left_out
+
+__all__ = ["Explanation", "Stage", "explain_frame"]
+
+# Stars without which no match is tried, and those that make it easy.
+_FEW, _PLENTY = 8, 30
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a frame.
+
+    Parameters
+    ----------
+    name : str
+        What is done.
+    went_well : bool
+        Whether the next stage could begin.
+    lines : tuple of str
+        What was found.
+    """
+
+    name: str
+    went_well: bool
+    lines: tuple
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What became of a frame, and why.
+
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+    status : str
+        ``solved``, ``degraded`` or ``failed``.
+    reasons : tuple of str
+        What it lacks, or the error.
+    stages : tuple of Stage
+        As far as it came.
+    advice : tuple of str
+        What to try next.
+    sources : `~astropy.table.Table` or None
+        What was measured.
+    usable : (N,) ndarray or None
+        Mask over the sources.
+    starts, references : (N, 2) ndarray or None
+        Usable sources, and reference stars at the epoch of the frame, in pixels of the header.
+    match : MatchedFrame or None
+        The match, if there is one.
+    calibration : Calibration or None
+        The result, if there is one.
+    """
+
+    frame: object
+    status: str
+    reasons: tuple
+    stages: tuple
+    advice: tuple
+    sources: object = None
+    usable: np.ndarray | None = None
+    starts: np.ndarray | None = None
+    references: np.ndarray | None = None
+    match: MatchedFrame | None = None
+    calibration: object = None
+
+
+class _Story:
+    """What is known so far."""
+
+    def __init__(self, frame, settings):
+        self.frame, self.settings = frame, settings
+        self.stages, self.advice, self.found = [], [], {}
+
+    def tell(self, name, *lines, went_well=True):
+        self.stages.append(Stage(name, went_well, tuple(lines)))
+
+    def end(self, status, reasons):
+        parts = (reasons, self.stages, dict.fromkeys(self.advice))
+        return Explanation(self.frame, status, *(tuple(part) for part in parts), **self.found)
+
+    def fail(self, name, error, *lines):
+        text = " ".join(str(error).split())
+        self.tell(name, *lines, text, went_well=False)
+        return self.end("failed", (text,))
+
+
+def explain_frame(frame, catalog, settings=None):
+    """Go through a frame stage by stage, and tell what was found and what to try.
+
+    Parameters
+    ----------
+    frame : Frame
+        Image or source list.
+    catalog : path-like, Table, SkyCoord, GaiaArchive or HatsCatalog
+        What `read_catalog` takes.
+    settings : Settings, optional
+        Choices, as for `calibrate`.
+
+    Returns
+    -------
+    Explanation
+        Whatever becomes of the frame; it is solved by itself, without others of its camera.
+
+    Raises
+    ------
+    InputError
+        If the catalog cannot be read.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import simulate
+    >>> from wpdc_gwcs.explanation import explain_frame
+    >>> sky = simulate(1, image_shape=(512, 512), density=60.0, distortion=5.0)
+    >>> told = explain_frame(sky.exposures[0].frame(), sky.reference)
+    >>> told.status, [stage.name for stage in told.stages]
+    ('solved', ['frame', 'sources', 'catalog', 'match', 'solution'])
+    """
+    settings = Settings() if settings is None else settings
+    story = _Story(frame, settings)
+    sky = sky_of_frame(frame, settings)
+    if sky is None:
+        story.advice.append("give a header with a celestial WCS (--wcs HEADER)")
+        return story.fail("frame", MatchError(f"{frame.source}: its WCS tells no place on the sky"))
+    _tell_frame(story)
+    try:
+        sources = with_errors(measure_sources(frame, settings))
+    except WPDCError as error:
+        story.advice.append("look at the image: --threshold, --saturation and --gain may be wrong")
+        return story.fail("sources", error)
+    usable = _tell_sources(story, sources)
+    stars = fill_motions(
+        read_catalog(catalog_source(catalog, max_mag=settings.max_mag), region=Region(*sky))
+    )
+    start = linear_wcs(frame.wcs, header_reference_point(frame))
+    x, y = (np.asarray(sources[name], float)[usable] for name in ("x", "y"))
+    story.found["starts"] = np.column_stack(start.pixels(*sky_of(frame.wcs, x, y)))
+    try:
+        reference = reference_in_reach(frame, stars, start, settings)
+    except MatchError as error:
+        story.advice.append(
+            f"take a catalog of this sky: wpdc catalog prepare gaia --around "
+            f"{shlex.quote(frame.source)} --output gaia.fits"
+        )
+        story.advice.append("or give another header, if this one points elsewhere (--wcs HEADER)")
+        return story.fail("catalog", error, f"{len(stars)} stars in the catalog or its part")
+    _tell_catalog(story, stars, reference, start)
+    try:
+        match = match_frame(frame, stars, settings, sources=sources)
+    except MatchError as error:
+        _try_otherwise(story, stars, sources)
+        return story.fail("match", error)
+    _tell_match(story, match)
+    _, calibrations, failures = solve_camera([match], settings)
+    if failures:
+        story.advice.append("solve it with others of its camera, or with a --solution")
+        return story.fail("solution", next(iter(failures.values())))
+    return _tell_solution(story, calibrations[0])
+
+
+def _tell_frame(story):
+    frame = story.frame
+    ny, nx = frame.image_shape
+    ra, dec = (float(c[0]) for c in sky_of(frame.wcs, [(nx - 1) / 2], [(ny - 1) / 2]))
+    start = linear_wcs(frame.wcs, header_reference_point(frame))
+    epoch = "no epoch" if frame.epoch is None else f"epoch {frame.epoch:.3f}"
+    kind = "an image" if frame.load_image is not None else "a list of sources"
+    story.tell(
+        "frame",
+        f"{frame.name}: {kind} of {nx} x {ny} px, detector {frame.detector}, {epoch}",
+        f"the header has its center at RA {ra:.5f} Dec {dec:.5f} deg, "
+        f"{start.scale * 3600:.4g} arcsec / px",
+    )
+    if frame.epoch is None:
+        story.advice.append("say when it was taken, so that the stars' motions count: --epoch DATE")
+
+
+def _tell_sources(story, sources):
+    rules = rules_of(sources, story.frame, story.settings)
+    usable = ~np.any(list(rules.values()), axis=0)
+    story.found |= {"sources": sources, "usable": usable}
+    lines = [f"{usable.sum()} of {len(sources)} take part", left_out(rules)]
+    fwhm = sources.meta.get("fwhm")
+    if fwhm is not None and np.isfinite(float(getattr(fwhm, "value", fwhm))):
+        lines.append(f"stars have a FWHM of {float(getattr(fwhm, 'value', fwhm)):.2f} px")
+    story.tell("sources", *lines, went_well=usable.sum() >= _FEW)
+    if usable.sum() < _PLENTY:
+        options = {
+            "not round": "--max-roundness",
+            "faint": "--min-snr",
+            "saturated": "--saturation",
+        }
+        worst = max(rules, key=lambda name: rules[name].sum())
+        option = next((o for word, o in options.items() if word in worst), "--threshold")
+        if rules[worst].any():
+            n = int(rules[worst].sum())
+            story.advice.append(f"{n} sources are left out as {worst}: look at {option}")
+    return usable
+
+
+def _tell_catalog(story, stars, reference, start):
+    ny, nx = story.frame.image_shape
+    x, y = start.pixels(np.asarray(reference["ra"]), np.asarray(reference["dec"]))
+    story.found["references"] = np.column_stack([x, y])
+    inside = int(np.sum((x > 0) & (x < nx) & (y > 0) & (y < ny)))
+    lines = [
+        f"{len(reference)} of {len(stars)} stars in reach, {inside} on the frame by its header"
+    ]
+    if "pmra" not in reference.colnames:
+        lines.append("it has no proper motions")
+    story.tell("catalog", *lines, went_well=inside >= _FEW)
+    n = int(np.sum(story.found["usable"]))
+    if inside > 20 * max(n, 1):
+        story.advice.append("the catalog is far deeper than the frame: try --max-mag")
+    if n > 20 * max(inside, 1):
+        story.advice.append("the frame is far deeper than the catalog: take a deeper one")
+
+
+def _tell_match(story, match):
+    found = match.diagnostics
+    story.found["match"] = match
+    story.tell(
+        "match",
+        f"{found.n_pairs} pairs, {found.expected_by_chance:.1f} expected by chance "
+        f"({found.significance:.0f} sigma), purity {found.purity:.3f}",
+        f"the header is off by {found.shift[0]:.1f}, {found.shift[1]:.1f} px, turned by "
+        f"{found.rotation:.3f} deg, scaled by {found.scale:.5f}"
+        + (", mirrored" if found.parity < 0 else ""),
+        f"{found.n_ambiguous} sources with two candidates left out, pairs scatter by "
+        f"{found.scatter:.2f} px about a smooth mapping",
+    )
+
+
+def _tell_solution(story, calibration):
+    statistics = calibration.statistics
+    story.found["calibration"] = calibration
+    residuals = statistics["residuals"]
+    reasons = tuple(statistics["reasons"])
+    story.tell(
+        "solution",
+        f"{statistics['n_used']} of {statistics['n_matched']} pairs used, residuals of "
+        f"{residuals['sigma_dx']:.4f} and {residuals['sigma_dy']:.4f} px, "
+        f"{statistics['rms_mas']:.2f} mas",
+        *(f"lacks: {reason}" for reason in reasons),
+        went_well=not reasons,
+    )
+    if reasons:
+        story.advice.append(
+            "solve it with dithered exposures of the same detector, with the other detectors of "
+            "its camera, or with a --solution"
+        )
+    return story.end(statistics["status"], reasons)
+
+
+def _try_otherwise(story, stars, sources):
+    """Find out which other choice would have matched the frame."""
+    name, settings = shlex.quote(story.frame.source), story.settings
+    trials = {
+        "--min-snr 3 --max-roundness 1": replace(settings, min_snr=3.0, max_roundness=1.0),
+        "--blind": replace(settings, blind=True),
+    }
+    for option, other in trials.items():
+        if other == settings:
+            continue
+        try:
+            match = match_frame(story.frame, stars, other, sources=sources)
+        except WPDCError:
+            continue
+        found = match.diagnostics
+        story.advice.append(
+            f"it matches with {option} ({found.n_pairs} pairs; the header is off by "
+            f"{np.hypot(*found.shift):.0f} px and {found.rotation:.1f} deg"
+            f"{', mirrored' if found.parity < 0 else ''}): wpdc calibrate {name} {option} ..."
+        )
+        return
+    story.advice.append(
+        "neither a blind search nor fainter stars match: look whether frame and catalog show the "
+        "same sky, and whether the scale is right (--pixel-scale)"
+    )
