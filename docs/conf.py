@@ -25,3 +25,8 @@ numpydoc_xref_param_type = False
 html_title = f"wpdc_gwcs {release}"
 html_copy_source = False
 htmlhelp_basename = "wpdc_gwcsdoc"
+
+# Sphinx takes a class for an alias if it calls itself by another name, as ours does for astropy.
+from wpdc_gwcs.wcs import DetectorWCS  # noqa: E402
+
+DetectorWCS.__name__ = DetectorWCS.__qualname__

@@ -428,7 +428,7 @@ def test_cpdis_is_what_plain_astropy_sees(tmp_path, crval, table):
 def test_cpdis_of_others_is_not_read_in_part(tmp_path, calibration):
     write(calibration, tmp_path / "a.fits", format="cpdis")
     with fits.open(tmp_path / "a.fits") as hdus:
-        del hdus[0].header["WPDCVERS"]
+        del hdus[0].header["WPDC*"]
         fits.HDUList([h for h in hdus if "WPDC" not in h.name]).writeto(tmp_path / "b.fits")
     with pytest.raises(FileFormatError, match="without look-up tables of others"):
         read(tmp_path / "b.fits")
@@ -911,6 +911,21 @@ def test_a_digit_of_a_header_of_ours_is_found(tmp_path, calibration, form):
     (tmp_path / "b.fits").write_bytes(data[:at] + digit + data[at + 1 :])
     with pytest.raises(FileFormatError, match="HDU 0 must agree with its CHECKSUM and DATASUM"):
         read(tmp_path / "b.fits")
+
+
+@pytest.mark.parametrize("keyword", ["WPDCVERS", "WPDCTAB"])
+@pytest.mark.parametrize("form", ["fits", "cpdis"])
+@pytest.mark.parametrize("reader", [read, read_any, read_wcs])
+def test_damage_to_our_keywords_is_found(tmp_path, calibration, reader, form, keyword):
+    """It would be a header of others, whose polynomial is all there is."""
+    write(calibration, tmp_path / "a.fits", format=form)
+    data = (tmp_path / "a.fits").read_bytes()
+    at = data.index(f"{keyword:<8}=".encode())
+    for k in (*range(len(keyword)), 8, 11):
+        changed = bytes([data[at + k] ^ 1])
+        (tmp_path / "b.fits").write_bytes(data[: at + k] + changed + data[at + k + 1 :])
+        with pytest.raises(FileFormatError, match=r"b\.fits"):
+            reader(tmp_path / "b.fits")
 
 
 def test_a_later_minor_version_opens(tmp_path, calibration):

@@ -28,7 +28,7 @@ from wpdc_gwcs.io.files import (
 )
 from wpdc_gwcs.io.fits import read_fits
 from wpdc_gwcs.io.formats import read_wcs
-from wpdc_gwcs.io.headers import header_shape, read_headers
+from wpdc_gwcs.io.headers import header_shape, is_ours, read_headers
 from wpdc_gwcs.io.integrity import check_size
 from wpdc_gwcs.io.tan import parse_tan
 
@@ -89,7 +89,7 @@ def _read_header(path, image_shape):
     header = headers[0]
     if "BEGAST_A" in header:
         return _fit(_read_ast(header, path), path, image_shape or header_shape(header))
-    ours = "WPDCVERS" in header and str(header.get("CTYPE1")) == "RA---TPV"
+    ours = is_ours(header) and str(header.get("CTYPE1")) == "RA---TPV"
     if ours or parse_tan(header, name=str(path)) is not None:
         found = read_fits(path)
         if found.solution.image_shape is not None:

@@ -27,7 +27,7 @@ from wpdc_gwcs.io.files import (
     split_extension,
     stem_of,
 )
-from wpdc_gwcs.io.headers import clean_header, find_extension, header_number, header_text
+from wpdc_gwcs.io.headers import clean_header, find_extension, header_number, header_text, is_ours
 from wpdc_gwcs.io.integrity import check_sums, check_version
 from wpdc_gwcs.io.tan import parse_tan
 from wpdc_gwcs.models import LookupTable, PVPolynomial
@@ -88,6 +88,7 @@ def write_form(obj, path, *, form, degree=None, overwrite=False):
     tables = list(made.tables)
     if form == "cpdis":
         tables += own_tables(made.written)
+        header["WPDCTAB"] = (1, "EXTVER of the tables WPDC_...")
     with atomic_path(path, overwrite=overwrite) as temporary:
         if tables or image_shape_of(obj) is None:
             fits.HDUList([fits.PrimaryHDU(header=header), *tables]).writeto(
@@ -178,7 +179,7 @@ def read_fits(path):
                 number = _only([i for i, hdu in enumerate(hdus) if "CTYPE1" in hdu.header], path)
             header = hdus[number].header.copy()
             several = len(hdus) > 1
-            if header_text(header, "WPDCVERS"):
+            if is_ours(header):
                 check_sums(hdus, path)
                 table, instrument = _read_own_tables(hdus, header, path)
         if several and extension is not None:

@@ -11,7 +11,7 @@ from wpdc_gwcs.exceptions import FileFormatError, WPDCWarning
 from wpdc_gwcs.export import FORMS
 from wpdc_gwcs.io.celestial import parse_wcs
 from wpdc_gwcs.io.files import check_output, file_kind, split_extension
-from wpdc_gwcs.io.headers import header_text, read_headers
+from wpdc_gwcs.io.headers import header_text, is_ours, read_headers
 from wpdc_gwcs.io.tan import parse_tan
 
 __all__ = ["FORMATS", "read", "read_wcs", "write"]
@@ -105,7 +105,7 @@ def read_wcs(source):
     headers = read_headers(source)
     if len(headers) > 1:
         raise FileFormatError(f"{source}: has {len(headers)} WCS headers; choose one with path[N]")
-    if header_text(headers[0], "WPDCVERS") and header_text(headers[0], "CTYPE1") == "RA---TPV":
+    if is_ours(headers[0]) and header_text(headers[0], "CTYPE1") == "RA---TPV":
         return read(source).wcs
     return _wcs_of(headers[0], str(source), plain)
 

@@ -17,6 +17,7 @@ __all__ = [
     "header_shape",
     "header_text",
     "header_value",
+    "is_ours",
     "positive_number",
     "read_headers",
 ]
@@ -240,6 +241,22 @@ def header_number(
         shown = "what cannot be parsed" if value is None else repr(value)
         raise error(f"{name}: card {key} must be a finite number, got {shown}")
     return float(value)
+
+
+def is_ours(header):
+    """Tell whether a header was written by this package to be read back.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        The header.
+
+    Returns
+    -------
+    bool
+        By any of the keywords that say so: damage to one does not make it another's.
+    """
+    return "WPDCVERS" in header or "WPDCTAB" in header
 
 
 def positive_number(headers, keys):

@@ -15,6 +15,7 @@ from astropy.io import fits
 from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.export import FORMAT_VERSION
 from wpdc_gwcs.io.files import READ_ERRORS, first_line
+from wpdc_gwcs.io.headers import is_ours
 
 __all__ = [
     "check_size",
@@ -117,7 +118,7 @@ def _is_ours(hdu):
     """Tell our tables, and our headers as they were written: alone, or before zeros."""
     if hdu.name.startswith("WPDC_"):
         return True
-    if "WPDCVERS" not in hdu.header or not isinstance(hdu, fits.PrimaryHDU):
+    if not is_ours(hdu.header) or not isinstance(hdu, fits.PrimaryHDU):
         return False
     return hdu.data is None or not hdu.data.any()
 

@@ -5,7 +5,7 @@ import re
 from astropy.io import fits
 
 from wpdc_gwcs.export import INSTRUMENT_NAME, TABLE_NAME
-from wpdc_gwcs.io.headers import header_text, header_value
+from wpdc_gwcs.io.headers import header_text, header_value, is_ours
 
 __all__ = ["alternates_of", "is_stale", "tables_of"]
 
@@ -106,7 +106,7 @@ def tables_of(header):
         # Without a name it refers to nothing, and not to all that have none.
         if header_text(header, f"CTYPE{axis}").endswith("-TAB") and name:
             found.add((name, _version(header, f"PV{axis}_1")))
-    if header_text(header, "WPDCVERS"):
+    if is_ours(header):
         version = _version(header, "WPDCTAB")
         found |= {(TABLE_NAME, version), (INSTRUMENT_NAME, version)}
     return found
