@@ -49,7 +49,15 @@ from wpdc_gwcs.lookup import ResidualMap
 from wpdc_gwcs.models import LookupTable, PVPolynomial
 from wpdc_gwcs.solution import Calibration, DistortionSolution
 
-__all__ = ["read_asdf", "read_asdf_wcs", "sum_of", "write_asdf", "write_stock"]
+__all__ = [
+    "read_asdf",
+    "read_asdf_wcs",
+    "read_entry",
+    "sum_of",
+    "write_asdf",
+    "write_stock",
+    "write_tree",
+]
 
 # Tables with files of their own, and what only the file of the detector itself needs.
 _NOT_STORED = {"matches", "sources"}
@@ -85,7 +93,7 @@ def write_asdf(obj, path, *, overwrite=False):
         if set(obj.files) != set(obj.detectors):
             raise InputError(f"{path}: a camera must name the solution file of each detector")
         tree |= {"kind": "camera", "software": software, **_fields_of(obj, {"solutions"})}
-        _write_tree({"wpdc": _summed(tree)}, path, overwrite)
+        write_tree({"wpdc": _summed(tree)}, path, overwrite)
         return
     if isinstance(obj, Calibration):
         tree |= {"kind": "calibration", "software": software, **_fields_of(obj, _NOT_STORED)}
@@ -94,7 +102,7 @@ def write_asdf(obj, path, *, overwrite=False):
     # A residual map is mostly empty bins.
     compression = "zlib" if getattr(obj, "residual_map", None) is not None else None
     trees = {"wcs": to_stock_wcs(obj.wcs), "wpdc": _summed(tree)}
-    _write_tree(trees, path, overwrite, compression)
+    write_tree(trees, path, overwrite, compression)
 
 
 def write_stock(obj, path, *, overwrite=False):
@@ -119,7 +127,7 @@ def write_stock(obj, path, *, overwrite=False):
     from wpdc_gwcs.wcs import to_stock_wcs
 
     wcs = to_stock_wcs(obj.wcs)
-    _write_tree({"wcs": wcs}, path, overwrite)
+    write_tree({"wcs": wcs}, path, overwrite)
     shape = obj.solution.image_shape if isinstance(obj, Calibration) else obj.image_shape
     return None if shape is None else deviation(obj, wcs, n=101)
 
@@ -159,7 +167,7 @@ def read_asdf(path):
     FileFormatError
         If the file is damaged, of a newer format version or not of this kind.
     """
-    tree = _read_entry(path, "wpdc", whole=True)
+    tree = read_entry(path, "wpdc", whole=True)
     if not isinstance(tree, dict):
         raise FileFormatError(f"{path}: must have a 'wpdc' tree, has none: not a wpdc_gwcs file")
     version = check_version(tree.get("format_version"), path)
@@ -221,7 +229,7 @@ def read_asdf_wcs(path):
     FileFormatError
         If the file is damaged or has no ``wcs``.
     """
-    wcs = _read_entry(path, "wcs")
+    wcs = read_entry(path, "wcs")
     if not hasattr(wcs, "pixel_to_world_values"):
         raise FileFormatError(f"{path}: must have a 'wcs' that gwcs can open, has none")
     return wcs
@@ -275,7 +283,20 @@ def _points_of(model):
     yield from getattr(model, "points", ())
 
 
-def _write_tree(tree, path, overwrite, compression=None):
+def write_tree(tree, path, overwrite, compression=None):
+    """Write a tree in one step.
+
+    Parameters
+    ----------
+    tree : dict
+        What the file holds; a gwcs under ``wcs`` keeps the nodes of its tables in the text.
+    path : path-like
+        File to write.
+    overwrite : bool
+        Whether an existing file may be replaced.
+    compression : str, optional
+        Of the arrays, as asdf names it.
+    """
     # A context copies what is loaded: extensions are to be looked for once, not for every file.
     unchecked = _unchecked(tuple(asdf.get_config().extensions))
     with (
@@ -292,8 +313,28 @@ def _write_tree(tree, path, overwrite, compression=None):
         file.write_to(stream, all_array_compression=compression)
 
 
-def _read_entry(path, key, *, whole=False):
-    """Read one entry of the tree and leave the others alone, which may be of newer libraries."""
+def read_entry(path, key, *, whole=False):
+    """Read one entry of the tree and leave the others alone, which may be of newer libraries.
+
+    Parameters
+    ----------
+    path : path-like
+        File to read.
+    key : str
+        Name of the entry.
+    whole : bool, optional
+        Whether the end of the file is looked for, too.
+
+    Returns
+    -------
+    object
+        Plain values, `None` where there is no such entry.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, damaged or cut short.
+    """
     try:
         # Absolute, since a leading '~' is not a name to asdf, even if the file is open.
         with open(Path(path).absolute(), "rb") as stream, warnings.catch_warnings():

@@ -30,7 +30,7 @@ from astropy.wcs import WCS
 from gwcs import WCS as GWCS
 
 from wpdc_gwcs.exceptions import FileFormatError
-from wpdc_gwcs.io.asdf import _read_entry, _write_tree
+from wpdc_gwcs.io.asdf import read_entry, write_tree
 from wpdc_gwcs.io.files import READ_ERRORS, first_line
 from wpdc_gwcs.io.integrity import check_version
 from wpdc_gwcs.simulation import Distortion, FrameTruth
@@ -154,7 +154,7 @@ def write_truths(truths, path, *, camera, catalog, files, overwrite=False):
         },
     }
     wcs = {t.name: {"wcs": true_wcs(t, first_step=first_steps[t.detector])} for t in truths}
-    _write_tree({"frames": wcs, "truth": tree}, path, overwrite)
+    write_tree({"frames": wcs, "truth": tree}, path, overwrite)
 
 
 def read_truths(path):
@@ -179,7 +179,7 @@ def read_truths(path):
     """
     if not Path(path).is_file():
         raise FileFormatError(f"{path}: no such file: the truth of a simulation is expected there")
-    tree = _read_entry(path, "truth")
+    tree = read_entry(path, "truth")
     if not isinstance(tree, dict):
         raise FileFormatError(f"{path}: must have a 'truth' tree, has none")
     check_version(tree.get("format_version"), path)
