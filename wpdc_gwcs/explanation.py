@@ -100,7 +100,7 @@ class _Story:
         self.stages, self.advice, self.found = [], [], {}
 
     def tell(self, name, *lines, went_well=True):
-        self.stages.append(Stage(name, went_well, tuple(lines)))
+        self.stages.append(Stage(name, bool(went_well), tuple(lines)))
 
     def end(self, status, reasons):
         parts = (reasons, self.stages, dict.fromkeys(self.advice))

@@ -89,6 +89,7 @@ def draw_catalog(stars):
     step = max(1, len(x) // 20_000)
     left.plot(x[::step], dec[::step], ".", ms=2, color=_BLUE, alpha=0.6)
     left.invert_xaxis()
+    left.ticklabel_format(useOffset=False)
     stretch = max(np.cos(np.radians(np.clip(np.median(dec), -85, 85))), 0.1)
     left.set(xlabel="RA (deg)", ylabel="Dec (deg)", aspect=1 / stretch, title=f"{len(x)} stars")
     mag = numbers_or_nan(stars, "phot_g_mean_mag")
@@ -235,8 +236,8 @@ def _arrows(panel, x, y, dx, dy, shape, title):
     typical = np.nanpercentile(length, 90) if np.isfinite(length).any() else 0.0
     key = 10.0 ** np.floor(np.log10(max(typical, 1e-6)))
     key *= next(f for f in (5, 2, 1) if f * key <= typical or f == 1)
-    # An arrow of the key is a tenth of the detector.
-    scale = 10 * key / max(shape)
+    # Long arrows are a twelfth of the detector, so that they do not hide each other.
+    scale = 12 * max(typical, key) / max(shape)
     options = {
         "angles": "xy",
         "scale_units": "xy",
@@ -251,7 +252,7 @@ def _arrows(panel, x, y, dx, dy, shape, title):
 
 def _detector(panel, shape, title):
     ny, nx = shape
-    panel.set(xlim=(-0.02 * nx, 1.02 * nx), ylim=(-0.02 * ny, 1.02 * ny), aspect="equal")
+    panel.set(xlim=(-0.06 * nx, 1.06 * nx), ylim=(-0.06 * ny, 1.06 * ny), aspect="equal")
     panel.set(xlabel="x (px)", ylabel="y (px)")
     panel.set_title(title, loc="left", fontsize=10)
 

@@ -35,7 +35,7 @@ class RadialWeight:
     of the paper, the bracket of the Gaussian put where it lets the weight fall):
 
     ==================  ======================================
-    ``exp-sqrt``        :math:`\exp(-\\sqrt{r_d - r_0})`
+    ``exp-sqrt``        :math:`\exp(-\sqrt{r_d - r_0})`
     ``gaussian``        :math:`\exp(-((r_d - r_0) / r_0)^2)`
     ``inverse``         :math:`r_0 / r_d`
     ``inverse-square``  :math:`(r_0 / r_d)^2`

@@ -64,7 +64,7 @@ def build_lookup_table(
        over a bin is not the value at its centroid: half the trace of Hessian times second moments
        is taken off, with a pilot surface.
     2. On larger bins, every kernel and length is diagonalised once, so that generalized
-       cross-validation over all smoothings (twelve decades) and polynomial degrees costs next to
+       cross-validation over all smoothings (thirteen decades) and polynomial degrees costs next to
        nothing.
     3. The best few, and no table at all, are compared by leaving out one group of exposures after
        the other.
