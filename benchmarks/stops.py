@@ -72,6 +72,8 @@ def numbers_of(folder):
 def main():
     trials = int(sys.argv[1]) if len(sys.argv) > 1 else 30
     rng = np.random.default_rng(int(sys.argv[2]) if len(sys.argv) > 2 else 1)
+    # Where this script runs in the background, Ctrl-C may be ignored, and programs inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     work = Path(tempfile.mkdtemp())
     frames, reference = make_inputs(work / "in")
     arguments = [*map(str, frames), "--catalog", str(reference), "--jobs", "2"]
@@ -102,7 +104,7 @@ def main():
                 time.sleep(0.05)
             seconds = time.perf_counter() - stopped
         problems = []
-        if group_alive(process.pid):
+        if seconds > PATIENCE or group_alive(process.pid):
             problems.append(f"alive after {PATIENCE:g} s")
         if "Traceback" in errors or len(errors.splitlines()) > 1:
             problems.append(f"said {errors!r}")
