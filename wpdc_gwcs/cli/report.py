@@ -7,6 +7,7 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import Overwrite, Quiet, require_free, require_plotting
+from wpdc_gwcs.exceptions import FileFormatError
 
 
 @app.command("report", no_args_is_help=True)
@@ -29,6 +30,9 @@ def report_command(
     output = folder / "report.html" if output is None else output
     require_free(output, overwrite)
     summary = read_table(folder / "summary.ecsv")
+    for column in ("frame", "detector", "status"):
+        if column not in summary.colnames:
+            raise FileFormatError(f"{folder / 'summary.ecsv'}: must have a column {column!r}")
     tables = {
         name: read_matches(folder / f"{name}.matches.ecsv")
         for name in summary["frame"][summary["status"] != "failed"]
