@@ -525,8 +525,19 @@ def _stock_first_step(distortion, image_shape):
     return pickle.loads(_last_first_step[1])
 
 
-def _polynomial2d(coefficients):
-    """Return a stock polynomial of ``coefficients[p, q]``, of total degree n - 1."""
+def stock_polynomial(coefficients):
+    """Return a stock polynomial.
+
+    Parameters
+    ----------
+    coefficients : (n, n) ndarray
+        Of ``x^p y^q`` at ``[p, q]``; those of a total degree of n and more are left out.
+
+    Returns
+    -------
+    `~astropy.modeling.models.Polynomial2D`
+        Of total degree n - 1.
+    """
     n = len(coefficients)
     terms = {f"c{p}_{q}": coefficients[p, q] for p in range(n) for q in range(n - p)}
     return Polynomial2D(n - 1, **terms)
@@ -541,13 +552,13 @@ def _stock_distortion(distortion):
     polynomial, radial = distortion.expand()
     crpix = distortion.crpix.value
     centered = Shift(-crpix[0]) & Shift(-crpix[1])
-    model = centered | _pair(*map(_polynomial2d, polynomial))
+    model = centered | _pair(*map(stock_polynomial, polynomial))
     if radial is not None:
         matrix = distortion.cd.value
         metric = matrix.T @ matrix
         squared = np.zeros((3, 3))
         squared[2, 0], squared[1, 1], squared[0, 2] = metric[0, 0], 2 * metric[0, 1], metric[1, 1]
-        radius = _polynomial2d(squared) ** Const2D(0.5)
+        radius = stock_polynomial(squared) ** Const2D(0.5)
         in_radius = (
             radius | Polynomial1D(len(row) - 1, **{f"c{s}": value for s, value in enumerate(row)})
             for row in radial
@@ -635,7 +646,7 @@ def _stock_inverse(distortion, image_shape):
     wide_x = (x_range[0] - margin, x_range[1] + margin)
     wide_y = (y_range[0] - margin, y_range[1] + margin)
     check = [v.ravel() for v in np.meshgrid(*_axes(x_range, y_range, 2 * _INVERSE_FIT_NODES))]
-    model = Shift(-origin[0]) & Shift(-origin[1]) | _pair(*map(_polynomial2d, polynomial))
+    model = Shift(-origin[0]) & Shift(-origin[1]) | _pair(*map(stock_polynomial, polynomial))
     for n_nodes in _INVERSE_TABLE_NODES:
         x_nodes, y_nodes = _axes(wide_x, wide_y, n_nodes)
         x, y = (v.ravel() for v in np.meshgrid(x_nodes, y_nodes))

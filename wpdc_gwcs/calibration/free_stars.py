@@ -13,6 +13,7 @@ import numpy as np
 
 from wpdc_gwcs.models import deproject, project
 from wpdc_gwcs.robust import robust_scatter
+from wpdc_gwcs.sky import angles, directions
 
 __all__ = ["solve_free_stars"]
 
@@ -118,12 +119,11 @@ def _scale(exposure):
     return np.sqrt(abs(np.linalg.det(exposure.cd))) * _MAS
 
 
-def _axes(ra, dec):
-    """Find unit vectors out, to the east and to the north, ``(3, N)`` each."""
-    a, d = np.radians(ra), np.radians(dec)
-    out = np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
-    east = np.array([-np.sin(a), np.cos(a), np.zeros_like(a)])
-    return out, east, np.cross(out, east, axis=0)
+def _stated(exposure):
+    """Split the stated errors: variances of the centroids along each axis, and the catalog's."""
+    both = np.square([exposure.x_err, exposure.y_err])
+    catalog = np.minimum(np.square(exposure.reference_err), both.mean(axis=0))
+    return both - catalog, catalog
 
 
 def _gather(exposures, moved, result):
@@ -138,12 +138,12 @@ def _gather(exposures, moved, result):
         star[s], told[s] = exposure.star, fit.used
         plane = np.array(project(now.ra, now.dec, fit.crval))
         plane = plane + fit.cd @ np.nan_to_num([fit.dx, fit.dy])
-        out, east, north = _axes(exposure.ra, exposure.dec)
-        apart = _axes(*deproject(*plane, fit.crval))[0] - out
+        out, east, north = directions(exposure.ra, exposure.dec)
+        apart = directions(*deproject(*plane, fit.crval))[0] - out
         offset[:, s] = np.degrees([np.sum(east * apart, 0), np.sum(north * apart, 0)]) * _MAS
-        total = 0.5 * (np.square(exposure.x_err) + np.square(exposure.y_err))
-        catalog[s] = np.minimum(np.square(exposure.reference_err), total) * _scale(exposure) ** 2
-        centroid[s] = total * _scale(exposure) ** 2 - catalog[s]
+        axes, reference = _stated(exposure)
+        centroid[s] = axes.mean(axis=0) * _scale(exposure) ** 2
+        catalog[s] = reference * _scale(exposure) ** 2
     told &= (catalog > 0) & (centroid > 0)
     number = np.unique(star, return_inverse=True)[1]
     return _Pairs(number, offset, centroid, catalog, told)
@@ -194,26 +194,18 @@ def _moved(exposures, pairs, scales):
         if exposure.reference_err is None:
             found.append(exposure)
             continue
-        out, east, north = _axes(exposure.ra, exposure.dec)
+        out, east, north = directions(exposure.ra, exposure.dec)
         de, dn = np.radians(offset[:, s] / _MAS)
-        x, y, z = out + de * east + dn * north
+        ra, dec = angles(out + de * east + dn * north)
         reference = variance[s] / _scale(exposure) ** 2
-        stated = np.minimum(np.square(exposure.reference_err), 0.5 * (
-            np.square(exposure.x_err) + np.square(exposure.y_err)))  # fmt: skip
-        errors = [
-            np.sqrt(np.maximum(scales[0] ** 2 * (np.square(e) - stated), 0.0) + reference)
-            for e in (exposure.x_err, exposure.y_err)
-        ]
+        centroid, _ = _stated(exposure)
+        x_err, y_err = np.sqrt(np.maximum(scales[0] ** 2 * centroid, 0.0) + reference)
         found.append(
             replace(
-                exposure,
-                ra=np.degrees(np.arctan2(y, x)) % 360.0,
-                dec=np.degrees(np.arctan2(z, np.hypot(x, y))),
-                x_err=errors[0],
-                y_err=errors[1],
+                exposure, ra=ra, dec=dec, x_err=x_err, y_err=y_err,
                 reference_err=np.sqrt(reference),
             )
-        )
+        )  # fmt: skip
     return found
 
 

@@ -11,6 +11,7 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import (
+    Blind,
     Cache,
     Config,
     Epoch,
@@ -33,6 +34,7 @@ from wpdc_gwcs.cli.options import (
     by_hand,
     require_free,
     require_plotting,
+    settings_of,
     state_first_pixel,
 )
 from wpdc_gwcs.cli.progress import progress_bar
@@ -190,12 +192,7 @@ def calibrate_command(
     mask: Mask = None,
     mask_bits: MaskBits = None,
     weight_map: WeightMap = None,
-    blind: Annotated[
-        bool,
-        typer.Option(
-            "--blind", help="Search flips, 90 degree turns, scale +-5 % and pointing +-1/4 frame."
-        ),
-    ] = False,
+    blind: Blind = False,
     holdout: Annotated[
         float,
         typer.Option(
@@ -246,7 +243,7 @@ def calibrate_command(
     the summary says what.  Exit status 1 if a frame was not solved: it has no WCS file, and its row
     of the summary says why.
     """
-    from wpdc_gwcs.calibration import Settings, calibrate
+    from wpdc_gwcs.calibration import calibrate
     from wpdc_gwcs.calibration.cluster import cluster_executor
     from wpdc_gwcs.calibration.results import ERRORS
     from wpdc_gwcs.catalogs import catalog_source
@@ -268,30 +265,27 @@ def calibrate_command(
         raise InputError(f"--scheduler-timeout must be positive seconds, got {scheduler_timeout}")
     if jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
-    try:
-        settings = Settings(
-            weight=weight,
-            r0=r0,
-            n_grid=n_grid,
-            lut=lut,
-            refine=refine,
-            free_stars=free_stars,
-            method=method,
-            degree=int(degree) if degree.isdigit() else degree,
-            centroids=centroids,
-            reference_point=reference_point,
-            threshold=threshold,
-            min_snr=min_snr,
-            max_roundness=max_roundness,
-            max_mag=max_mag,
-            gain=gain,
-            saturation=saturation,
-            blind=blind,
-            holdout=holdout,
-            seed=seed,
-        )
-    except ValueError as err:
-        raise InputError(str(err)) from err
+    settings = settings_of(
+        weight=weight,
+        r0=r0,
+        n_grid=n_grid,
+        lut=lut,
+        refine=refine,
+        free_stars=free_stars,
+        method=method,
+        degree=degree,
+        centroids=centroids,
+        reference_point=reference_point,
+        threshold=threshold,
+        min_snr=min_snr,
+        max_roundness=max_roundness,
+        max_mag=max_mag,
+        gain=gain,
+        saturation=saturation,
+        blind=blind,
+        holdout=holdout,
+        seed=seed,
+    )
 
     keys = {"exposure_keyword": exposure_key, "camera": not no_camera}
     keys |= by_hand(epoch, pixel_scale, origin)

@@ -14,6 +14,7 @@ from wpdc_gwcs.cli.app import set_verbosity
 from wpdc_gwcs.exceptions import InputError
 
 __all__ = [
+    "Blind",
     "Cache",
     "Config",
     "Epoch",
@@ -34,6 +35,7 @@ __all__ = [
     "Verbose",
     "by_hand",
     "read_numbers",
+    "settings_of",
     "state_first_pixel",
     "WeightMap",
     "require_free",
@@ -147,6 +149,13 @@ MinSNR = Annotated[
     float,
     typer.Option(
         metavar="RATIO", help="Least signal-to-noise ratio of a source kept; 0 keeps all."
+    ),
+]
+
+Blind = Annotated[
+    bool,
+    typer.Option(
+        "--blind", help="Search flips, 90 degree turns, scale +-5 % and pointing +-1/4 frame."
     ),
 ]
 
@@ -266,6 +275,34 @@ def by_hand(epoch, pixel_scale, origin):
     except ValueError as problem:
         raise InputError(f"--{problem}") from problem
     return {"epoch": year, "pixel_scale": pixel_scale, "origin": origin}
+
+
+def settings_of(**choices):
+    """Make the settings of a calibration.
+
+    Parameters
+    ----------
+    **choices
+        As for `wpdc_gwcs.calibration.Settings`; ``degree`` is the text of its option.
+
+    Returns
+    -------
+    Settings
+        The settings.
+
+    Raises
+    ------
+    InputError
+        If one of them cannot be.
+    """
+    from wpdc_gwcs.calibration import Settings
+
+    try:
+        if (degree := choices.get("degree", "auto")).isdigit():
+            choices["degree"] = int(degree)
+        return Settings(**choices)
+    except ValueError as err:
+        raise InputError(str(err)) from err
 
 
 def read_numbers(option, text, n=None, separator=","):

@@ -10,6 +10,7 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.calibrate import Catalog, WcsFile
 from wpdc_gwcs.cli.options import (
+    Blind,
     Cache,
     Epoch,
     MaxMag,
@@ -25,6 +26,7 @@ from wpdc_gwcs.cli.options import (
     by_hand,
     require_free,
     require_plotting,
+    settings_of,
 )
 from wpdc_gwcs.cli.stages import one_frame
 from wpdc_gwcs.exceptions import FileFormatError, FrameError, InputError
@@ -75,12 +77,7 @@ def explain_command(
     max_roundness: MaxRoundness = 0.3,
     max_mag: MaxMag = None,
     saturation: Saturation = None,
-    blind: Annotated[
-        bool,
-        typer.Option(
-            "--blind", help="Search flips, 90 degree turns, scale +-5 % and pointing +-1/4 frame."
-        ),
-    ] = False,
+    blind: Blind = False,
     tap_url: TapUrl = None,
     cache: Cache = None,
     overwrite: Overwrite = False,
@@ -90,23 +87,19 @@ def explain_command(
 
     The frame is solved by itself, without others of its camera.  Exit status 1 if it fails.
     """
-    from wpdc_gwcs.calibration import Settings
     from wpdc_gwcs.catalogs import catalog_source
     from wpdc_gwcs.explanation import explain_frame
     from wpdc_gwcs.pictures import draw_explanation
 
     _check_picture(output, overwrite)
-    try:
-        settings = Settings(
-            threshold=threshold,
-            min_snr=min_snr,
-            max_roundness=max_roundness,
-            max_mag=max_mag,
-            saturation=saturation,
-            blind=blind,
-        )
-    except ValueError as err:
-        raise InputError(str(err)) from err
+    settings = settings_of(
+        threshold=threshold,
+        min_snr=min_snr,
+        max_roundness=max_roundness,
+        max_mag=max_mag,
+        saturation=saturation,
+        blind=blind,
+    )
     one = one_frame(frame, wcs=wcs, **by_hand(epoch, pixel_scale, origin))
     source = catalog_source(catalog, url=tap_url, cache=cache, max_mag=max_mag)
     told = explain_frame(one, source, settings)

@@ -9,6 +9,7 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.calibrate import Catalog, WcsFile
 from wpdc_gwcs.cli.options import (
+    Blind,
     Cache,
     Epoch,
     Gain,
@@ -28,6 +29,7 @@ from wpdc_gwcs.cli.options import (
     WeightMap,
     by_hand,
     require_free,
+    settings_of,
     state_first_pixel,
 )
 from wpdc_gwcs.exceptions import InputError
@@ -80,20 +82,17 @@ def detect_command(
     quiet: Quiet = False,
 ):
     """Detect the stars of an image and measure their positions."""
-    from wpdc_gwcs.calibration import Settings, measure_sources
+    from wpdc_gwcs.calibration import measure_sources
     from wpdc_gwcs.io import write_table
 
     require_free(output, overwrite)
-    try:
-        settings = Settings(
-            centroids=centroids,
-            threshold=threshold,
-            min_snr=min_snr,
-            gain=gain,
-            saturation=saturation,
-        )
-    except ValueError as err:
-        raise InputError(str(err)) from err
+    settings = settings_of(
+        centroids=centroids,
+        threshold=threshold,
+        min_snr=min_snr,
+        gain=gain,
+        saturation=saturation,
+    )
     planes = {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
     sources = measure_sources(one_frame(frame, **planes), settings)
     write_table(sources, output, overwrite=overwrite)
@@ -124,12 +123,7 @@ def match_command(
     mask: Mask = None,
     mask_bits: MaskBits = None,
     weight_map: WeightMap = None,
-    blind: Annotated[
-        bool,
-        typer.Option(
-            "--blind", help="Search flips, 90 degree turns, scale +-5 % and pointing +-1/4 frame."
-        ),
-    ] = False,
+    blind: Blind = False,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
@@ -137,23 +131,20 @@ def match_command(
     """Match the sources of a frame to a catalog; exit status 1 without enough evidence."""
     import numpy as np
 
-    from wpdc_gwcs.calibration import Settings, match_frame
+    from wpdc_gwcs.calibration import match_frame
     from wpdc_gwcs.catalogs import catalog_source
     from wpdc_gwcs.io import write_table
     from wpdc_gwcs.matching import pair_table
 
     require_free(output, overwrite)
-    try:
-        settings = Settings(
-            blind=blind,
-            min_snr=min_snr,
-            max_roundness=max_roundness,
-            max_mag=max_mag,
-            gain=gain,
-            saturation=saturation,
-        )
-    except ValueError as err:
-        raise InputError(str(err)) from err
+    settings = settings_of(
+        blind=blind,
+        min_snr=min_snr,
+        max_roundness=max_roundness,
+        max_mag=max_mag,
+        gain=gain,
+        saturation=saturation,
+    )
     given = by_hand(epoch, pixel_scale, origin)
     given |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
     one = one_frame(frame, wcs=wcs, **given)

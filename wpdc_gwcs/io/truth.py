@@ -26,7 +26,6 @@ from pathlib import Path
 
 import numpy as np
 from astropy.modeling.models import Mapping, Polynomial2D, Scale, Shift, Sine1D
-from astropy.wcs import WCS
 from gwcs import WCS as GWCS
 
 from wpdc_gwcs.exceptions import FileFormatError
@@ -34,7 +33,8 @@ from wpdc_gwcs.io.asdf import read_entry, write_tree
 from wpdc_gwcs.io.files import READ_ERRORS, first_line
 from wpdc_gwcs.io.integrity import check_version
 from wpdc_gwcs.simulation import Distortion, FrameTruth
-from wpdc_gwcs.wcs import build_wcs, to_stock_wcs
+from wpdc_gwcs.simulation.pointing import tan_wcs
+from wpdc_gwcs.wcs import build_wcs, stock_polynomial, to_stock_wcs
 
 __all__ = ["read_truths", "true_wcs", "write_truths"]
 
@@ -87,7 +87,7 @@ def _stock_distortion(distortion):
         imaginary[m + n - k, k] += product.imag
     real[1, 0] += 1
     imaginary[0, 1] += 1
-    axes = [_polynomial(real), _polynomial(imaginary)]
+    axes = [stock_polynomial(real), stock_polynomial(imaginary)]
     for kappa, phase, amplitude in distortion.waves:
         angle = Polynomial2D(1, c0_0=phase, c1_0=kappa.real, c0_1=kappa.imag)
         for axis, size_of in enumerate((amplitude.real, amplitude.imag)):
@@ -102,12 +102,6 @@ def _stock_distortion(distortion):
         | Scale(half) & Scale(half)
         | Shift(x0) & Shift(y0)
     )
-
-
-def _polynomial(coefficients):
-    n = len(coefficients)
-    terms = {f"c{i}_{j}": coefficients[i, j] for i in range(n) for j in range(n - i)}
-    return Polynomial2D(n - 1, **terms)
 
 
 def write_truths(truths, path, *, camera, catalog, files, overwrite=False):
@@ -192,7 +186,12 @@ def read_truths(path):
                 float(node["epoch"]),
                 node["exposure"],
                 distortions[node["detector"]],
-                _linear_wcs(node, distortions[node["detector"]].image_shape),
+                tan_wcs(
+                    node["crpix"],
+                    node["crval"],
+                    node["cd"],
+                    distortions[node["detector"]].image_shape,
+                ),
             )
             for name, node in tree["frames"].items()
         }
@@ -223,14 +222,3 @@ def _distortion_of(node):
         {(m, n): complex(a, b) for m, n, a, b in node["terms"]},
         tuple((complex(a, b), phase, complex(c, d)) for a, b, phase, c, d in node["waves"]),
     )
-
-
-def _linear_wcs(node, image_shape):
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.cunit = ["deg", "deg"]
-    wcs.wcs.crpix, wcs.wcs.crval, wcs.wcs.cd = node["crpix"], node["crval"], node["cd"]
-    wcs.wcs.radesys = "ICRS"
-    wcs.array_shape = image_shape
-    wcs.wcs.set()
-    return wcs

@@ -8,7 +8,7 @@ from astropy.wcs import WCS
 from wpdc_gwcs.simulation.stars import offset_positions
 from wpdc_gwcs.sky import angles, directions
 
-__all__ = ["Pointing", "aim"]
+__all__ = ["Pointing", "aim", "tan_wcs"]
 
 
 @dataclass(frozen=True)
@@ -64,16 +64,7 @@ class Pointing:
         else:
             crval, turn = self._carry(*(cd @ place))
             cd = cd if turn is None else turn @ cd
-        wcs = WCS(naxis=2)
-        wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-        wcs.wcs.cunit = ["deg", "deg"]
-        wcs.wcs.crpix = crpix
-        wcs.wcs.crval = crval
-        wcs.wcs.cd = cd * detector.axes
-        wcs.wcs.radesys = "ICRS"
-        wcs.array_shape = detector.image_shape
-        wcs.wcs.set()
-        return wcs
+        return tan_wcs(crpix, crval, cd * detector.axes, detector.image_shape)
 
     def _carry(self, east, north):
         """Direction at an offset in the tangent plane, and how the plane's axes turn there.
@@ -117,3 +108,32 @@ def aim(ra, dec, roll, scale, middle):
     if np.hypot(east, north) == 0:
         return pointing
     return Pointing(*map(float, offset_positions(ra, dec, -east, -north)), float(roll), scale)
+
+
+def tan_wcs(crpix, crval, cd, image_shape):
+    """Make a linear WCS in ICRS.
+
+    Parameters
+    ----------
+    crpix : (2,) array_like
+        Reference point, px, counted from 1.
+    crval : (2,) array_like
+        Its direction, deg.
+    cd : (2, 2) array_like
+        Matrix, deg / px.
+    image_shape : (int, int)
+        Shape ``(ny, nx)`` in px.
+
+    Returns
+    -------
+    `~astropy.wcs.WCS`
+        Gnomonic.
+    """
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.cunit = ["deg", "deg"]
+    wcs.wcs.crpix, wcs.wcs.crval, wcs.wcs.cd = crpix, crval, cd
+    wcs.wcs.radesys = "ICRS"
+    wcs.array_shape = image_shape
+    wcs.wcs.set()
+    return wcs

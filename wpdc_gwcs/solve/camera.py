@@ -470,9 +470,10 @@ def _result(o, state, stored, infos, group, settings, cd, update):
     n_grid, lut, refine, degree = (settings[k] for k in ("n_grid", "lut", "refine", "degree"))
     pv_degree = settings["pv_degree"]
     solutions = {}
+    factors = [inherited(o, state, k) for k in range(len(o.detectors))]
     tables = [
-        _table_sigma(o, state, k, info, stored.get(d.name))
-        for k, (d, info) in enumerate(zip(o.detectors, infos))
+        _table_sigma(info, stored.get(d.name), factor)
+        for d, info, factor in zip(o.detectors, infos, factors)
     ]
     weights = settings.pop("weight")
     del settings["pv_degree"]
@@ -488,7 +489,7 @@ def _result(o, state, stored, infos, group, settings, cd, update):
             solution = represent_detector(
                 o, state, k, weight=weights[detector.name], degree=pv_degree,
                 n_grid=0 if lut == "none" else n_grid, cd=cd,
-                table_sigma=None if infos[k] is None else tables[k],
+                table_sigma=None if infos[k] is None else tables[k], factor=factors[k],
             )  # fmt: skip
         weight = weights[detector.name]
         solutions[detector.name] = replace(
@@ -508,7 +509,7 @@ def _result(o, state, stored, infos, group, settings, cd, update):
             tabled = lut != "none" or refine == "field"
             parts = represent_frame(
                 o, state, f, solution, n_grid=n_grid if tabled else 0,
-                table_sigma=tables[o.detector_of[f]],
+                table_sigma=tables[o.detector_of[f]], factor=factors[o.detector_of[f]],
                 places=places,
             )  # fmt: skip
             if not tabled:
@@ -524,10 +525,9 @@ def _result(o, state, stored, infos, group, settings, cd, update):
     return SolveResult(solutions, tuple(fits), rejected, named, color)
 
 
-def _table_sigma(o, state, k, info, stored):
+def _table_sigma(info, stored, factor):
     """Uncertainty of what stands beside the shared terms: a smoothed table, a stored solution."""
     if info is not None and info.sigma is not None:
-        factor = inherited(o, state, k)
         return info.sigma * np.array([factor, factor, 1.0])[:, None, None]
     return None if stored is None or info is not None else stored.table_sigma
 

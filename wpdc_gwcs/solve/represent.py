@@ -25,7 +25,9 @@ _NODES_PER_WAVE = 5
 _LEAST_FIELD = 1e-4
 
 
-def represent_detector(o, state, k, *, weight, degree, n_grid, cd=None, table_sigma=None):
+def represent_detector(
+    o, state, k, *, weight, degree, n_grid, cd=None, table_sigma=None, factor=1.0
+):
     """Polynomial and table of one detector.
 
     Parameters
@@ -46,6 +48,8 @@ def represent_detector(o, state, k, *, weight, degree, n_grid, cd=None, table_si
         Nominal matrix.
     table_sigma : (3, n, n) ndarray, optional
         Uncertainty of the smoothed table.
+    factor : float, optional
+        As from `inherited`.
 
     Returns
     -------
@@ -66,7 +70,7 @@ def represent_detector(o, state, k, *, weight, degree, n_grid, cd=None, table_si
         left = np.linalg.solve(cd0, np.array(pv(*(cd0 @ offset))) - target)
         edges = [np.linspace(-0.5, n - 0.5, n_grid) for n in detector.image_shape[::-1]]
         table = LookupTable(*edges, *left.reshape(2, n_grid, n_grid))
-    sigma = _instrument_sigma(o, state, frame, x, y, table_sigma)
+    sigma = _instrument_sigma(o, state, frame, x, y, table_sigma, factor)
     return DistortionSolution(
         detector=detector.name,
         image_shape=detector.image_shape,
@@ -107,11 +111,11 @@ def sigma_grid(covariance, n):
     return np.array([*sigma, rho]).reshape(3, n, n)
 
 
-def _instrument_sigma(o, state, frame, x, y, table_sigma):
+def _instrument_sigma(o, state, frame, x, y, table_sigma, factor):
     """Uncertainty of what the exposures share, without what their attitudes take, on a grid."""
     n = int(np.sqrt(len(x)))
     table = None if table_sigma is None else covariance_of(table_sigma.reshape(3, -1))
-    growth = _growth(o, state, int(o.detector_of[frame]), x, y)
+    growth = factor * _growth(o, state, int(o.detector_of[frame]), x, y)
     covariance = predict_variance(
         o, state, frame, x, y, table=table, growth=growth, instrument_only=True
     )
@@ -119,14 +123,10 @@ def _instrument_sigma(o, state, frame, x, y, table_sigma):
 
 
 def _growth(o, state, k, x, y):
-    """Factors of the errors of a detector's distortion.
-
-    For the distance to the stars behind it, and for what all exposures inherit from these stars.
-    """
+    """Factors of the errors of a detector's distortion for the distance to the stars behind it."""
     detector, behind = o.detectors[k], _behind(o, state, k)
     stars = detector.normalized(o.x[behind], o.y[behind])
-    far = extrapolation(np.array(stars), np.array(detector.normalized(x, y)))
-    return inherited(o, state, k) * far
+    return extrapolation(np.array(stars), np.array(detector.normalized(x, y)))
 
 
 def inherited(o, state, k):
@@ -155,7 +155,7 @@ def _behind(o, state, k):
     return behind
 
 
-def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places):
+def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places, factor=1.0):
     """Attitude, field and uncertainty of one frame on top of its detector's solution.
 
     Parameters
@@ -176,6 +176,8 @@ def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places):
     places : dict
         Undistorted positions of grids, and what is known of the distance to the stars, which all
         frames of a detector have in common.
+    factor : float, optional
+        As from `inherited`.
 
     Returns
     -------
@@ -212,7 +214,7 @@ def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places):
         table = replace(solution, table_sigma=table_sigma).covariance(gx, gy)
     key = (detector.name, "growth")
     if key not in places:
-        places[key] = _growth(o, state, k, gx, gy)
+        places[key] = factor * _growth(o, state, k, gx, gy)
     covariance = predict_variance(o, state, f, gx, gy, table=table, growth=places[key])
     if field is None:
         covariance = covariance + left[:, None] * left
