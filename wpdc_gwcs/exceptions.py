@@ -23,6 +23,7 @@ __all__ = [
     "MatchError",
     "WPDCError",
     "WPDCWarning",
+    "without_frames",
 ]
 
 
@@ -107,3 +108,21 @@ class WPDCWarning(AstropyUserWarning):
 
 class CentroidWarning(WPDCWarning):
     """Centroids are of lower quality than asked for: windowed, for example, not PSF-fitted."""
+
+
+def without_frames(error):
+    """Let an error that is kept forget where it was raised.
+
+    Parameters
+    ----------
+    error : Exception
+        Its tracebacks, and those of what led to it, hold every array of the functions that it came
+        through: of an image, a hundred times what the frame needs.
+
+    Returns
+    -------
+    Exception
+        The same.
+    """
+    error.__traceback__ = error.__context__ = error.__cause__ = None
+    return error

@@ -7,9 +7,11 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.inputs import expand_paths
 from wpdc_gwcs.cli.options import (
     Blind,
     Cache,
@@ -43,6 +45,9 @@ from wpdc_gwcs.exceptions import FrameFailure, InputError, InternalError
 
 log = logging.getLogger("wpdc_gwcs.cli")
 
+# More frames than this are not told one by one.
+_MOST_LINES = 100
+
 Catalog = Annotated[
     str,
     typer.Option(
@@ -68,7 +73,8 @@ def calibrate_command(
         list[str],
         typer.Argument(
             metavar="FRAME",
-            help="FITS images (path or path[EXT]), FITS_LDAC lists, or source tables with --wcs.",
+            help="FITS images (path or path[EXT]), FITS_LDAC lists, or source tables with --wcs; "
+            "folders of them, patterns in quotes, @LIST for a file with one in each line.",
         ),
     ],
     catalog: Catalog,
@@ -290,7 +296,9 @@ def calibrate_command(
     keys = {"exposure_keyword": exposure_key, "camera": not no_camera}
     keys |= by_hand(epoch, pixel_scale, origin)
     keys |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
-    loaded = read_files(frames, wcs=wcs, detector=detector, **keys)
+    maps = [path for path in (catalog, mask, weight_map) if path is not None]
+    paths = expand_paths(frames, without=maps)
+    loaded = read_files(paths, wcs=wcs, detector=detector, **keys)
     page = output / "report.html"
     if report:
         require_free(page, overwrite or resume)
@@ -308,11 +316,11 @@ def calibrate_command(
             output=output,
             overwrite=overwrite,
             resume=resume,
+            keep=False,
             progress=progress,
         )
     if report:
-        tables = {c.frame: c.matches for c in run.calibrations}
-        write_page(run.summary, run.solutions, tables, page, overwrite=overwrite or resume)
+        write_page(output, page, overwrite=overwrite or resume)
     if not quiet:
         if resume:
             typer.echo(
@@ -323,14 +331,18 @@ def calibrate_command(
         if update:
             print_changes(run)
     state_first_pixel(loaded)
-    for calibration in run.calibrations:
-        if calibration.statistics["reasons"]:
-            log.warning(
-                "%s: degraded: %s", calibration.frame, "; ".join(calibration.statistics["reasons"])
-            )
-    for name, error in run.failures.items():
+    degraded = [row for row in run.summary if row["status"] == "degraded"]
+    for row in degraded[:_MOST_LINES]:
+        log.warning("%s: degraded: %s", row["frame"], row["reason"])
+    for name, error in list(run.failures.items())[:_MOST_LINES]:
         details = f" (details in {output / ERRORS})" if isinstance(error, InternalError) else ""
         log.error("%s: not solved: %s%s", name, error, details)
+    for what, found in (("degraded", degraded), ("not solved", run.failures)):
+        if len(found) > _MOST_LINES:
+            log.warning(
+                "%d more frames are %s: see the column 'reason' of %s",
+                len(found) - _MOST_LINES, what, output / "summary.ecsv",
+            )  # fmt: skip
     refused = [f.source for f in loaded if isinstance(run.failures.get(f.name), FrameFailure)]
     if refused and not quiet:
         given = f"{shlex.quote(refused[0])} --catalog {shlex.quote(catalog)}"
@@ -418,18 +430,22 @@ def print_summary(run, folder):
     folder : Path
         Where the results are.
     """
-    width = max([len("frame"), *(len(name) for name in run.summary["frame"])])
+    shown = run.summary
+    if len(shown) > _MOST_LINES:
+        typer.echo(f"{len(shown)} frames, see {folder / 'summary.ecsv'}; the last {_MOST_LINES}:")
+        shown = shown[-_MOST_LINES:]
+    width = max([len("frame"), *(len(name) for name in shown["frame"])])
     typer.echo(
         f"{'frame':<{width}}  status    sources  matched  sigma_dx  sigma_dy  rms_mas  seconds"
     )
-    for row in run.summary:
+    for row in shown:
         typer.echo(
             f"{row['frame']:<{width}}  {row['status']:<8}  {row['n_sources']:7d}  "
             f"{row['n_matched']:7d}  "
             f"{float(row['sigma_dx'].value):8.4f}  {float(row['sigma_dy'].value):8.4f}  "
             f"{float(row['rms_mas'].value):7.2f}  {float(row['seconds'].value):7.2f}"
         )
-    n = len(run.calibrations)
-    degraded = sum(row["status"] == "degraded" for row in run.summary)
+    n = int(np.sum(run.summary["status"] != "failed"))
+    degraded = int(np.sum(run.summary["status"] == "degraded"))
     also = f", {degraded} of them degraded" if degraded else ""
     typer.echo(f"{n} of {len(run.summary)} frames solved{also}; results in {os.fspath(folder)}")
