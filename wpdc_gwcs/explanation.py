@@ -22,9 +22,9 @@ from wpdc_gwcs.calibration.matched import (
 from wpdc_gwcs.calibration.measure import measure_sources, rules_of
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs, sky_of
+from wpdc_gwcs.calibration.story import tell_match, tell_sources
 from wpdc_gwcs.catalogs import Region, catalog_source, fill_motions, read_catalog
 from wpdc_gwcs.exceptions import MatchError, WPDCError
-from wpdc_gwcs.selection import left_out
 
 __all__ = ["Explanation", "Stage", "explain_frame"]
 
@@ -206,10 +206,7 @@ def _tell_sources(story, sources):
     rules = rules_of(sources, story.frame, story.settings)
     usable = ~np.any(list(rules.values()), axis=0)
     story.found |= {"sources": sources, "usable": usable}
-    lines = [f"{usable.sum()} of {len(sources)} take part", left_out(rules)]
-    fwhm = sources.meta.get("fwhm")
-    if fwhm is not None and np.isfinite(float(getattr(fwhm, "value", fwhm))):
-        lines.append(f"stars have a FWHM of {float(getattr(fwhm, 'value', fwhm)):.2f} px")
+    lines = tell_sources(sources, story.frame, story.settings)
     story.tell("sources", *lines, went_well=usable.sum() >= _FEW)
     if usable.sum() < _PLENTY:
         options = {
@@ -244,18 +241,8 @@ def _tell_catalog(story, stars, reference, start):
 
 
 def _tell_match(story, match):
-    found = match.diagnostics
     story.found["match"] = match
-    story.tell(
-        "match",
-        f"{found.n_pairs} pairs, {found.expected_by_chance:.1f} expected by chance "
-        f"({found.significance:.0f} sigma), purity {found.purity:.3f}",
-        f"the header is off by {found.shift[0]:.1f}, {found.shift[1]:.1f} px, turned by "
-        f"{found.rotation:.3f} deg, scaled by {found.scale:.5f}"
-        + (", mirrored" if found.parity < 0 else ""),
-        f"{found.n_ambiguous} sources with two candidates left out, pairs scatter by "
-        f"{found.scatter:.2f} px about a smooth mapping",
-    )
+    story.tell("match", *tell_match(match.diagnostics))
 
 
 def _tell_solution(story, calibration):

@@ -3,6 +3,7 @@
 import itertools
 import logging
 import os
+import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
@@ -21,6 +22,12 @@ from wpdc_gwcs.calibration.matched import FailedFrame, sky_of_frame
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.results import Outcome, ResultFolder
 from wpdc_gwcs.calibration.settings import Settings
+from wpdc_gwcs.calibration.story import (
+    tell_catalog,
+    tell_frames,
+    tell_outcome,
+    tell_result,
+)
 from wpdc_gwcs.calibration.summary import summarize, summary_row
 from wpdc_gwcs.calibration.workers import Task, Workers, internal_error, stored_of
 from wpdc_gwcs.camera import build_camera
@@ -208,6 +215,7 @@ def calibrate(
             update=update,
             earlier=() if folder is None else folder.earlier_groups(),
         )
+        _say(tell_frames, frames, groups)
         catalog = catalog_source(catalog, max_mag=settings.max_mag)
         path = catalog if isinstance(catalog, str | os.PathLike) else None
         # Before the catalog, which may take a while.
@@ -216,7 +224,9 @@ def calibrate(
         if not hasattr(catalog, "stars_of"):
             # What is in memory is there as a whole; of a file all that the run needs, once.
             region = None if path is None else _sky_of(frames, settings, solution)
+            began = time.perf_counter()
             catalog = fill_motions(read_catalog(catalog, region=region))
+            _say(tell_catalog, catalog, time.perf_counter() - began)
         run_id = uuid.uuid4().hex[:12]
         if folder is not None:
             plan = plan_run(
@@ -241,7 +251,12 @@ def calibrate(
                     _log_details(name, error, folder)
                 if folder is not None:
                     announce("files")
+                    began = time.perf_counter()
                     folder.write(group, outcome)
+                    log.info(
+                        "files: results of %d of the frames are in %s (%.1f s)",
+                        len(group), output, time.perf_counter() - began,
+                    )  # fmt: skip
     resumed = tuple(frame.name for group in done for frame in group)
     return _joined(frames, list(outcomes.values()), run_id, resumed)
 
@@ -297,7 +312,10 @@ class _Run:
             # They fail by themselves, whatever the catalog.
             cones = (_sky_of([f], self.settings, self.solution) for f in self.frames)
             sky = next((cone for cone in cones if cone is not None), None)
-        return fill_motions(read_catalog(self.catalog, region=sky))
+        began = time.perf_counter()
+        part = fill_motions(read_catalog(self.catalog, region=sky))
+        _say(tell_catalog, part, time.perf_counter() - began)
+        return part
 
 
 @dataclass(eq=False)
@@ -338,14 +356,18 @@ def _outcomes(groups, run, workers):
             break
         work = begun[0]
         try:
-            results = {f.name: other[f.name] for f in work.group} if other else {}
+            frames = {f.name: f for f in work.group}
+            results = {name: other[name] for name in frames} if other else {}
             for name in list(work.tasks):
                 results[name] = work.tasks.pop(name)()
+                _say(tell_result, frames[name], results[name], run.settings)
                 run.progress("match", next(counter), n_frames)
                 begin()
             run.progress("solve", k, len(groups))
             announce("solution")
+            began = time.perf_counter()
             outcome = _outcome_of(work, results, run, None if other else workers)
+            _say(tell_outcome, outcome, time.perf_counter() - began)
         except ClusterError as err:
             lost = lost or err
             continue
@@ -355,6 +377,13 @@ def _outcomes(groups, run, workers):
     if lost is not None:
         raise lost
     run.progress("solve", len(groups), len(groups))
+
+
+def _say(tell, *what):
+    """Log the lines of a stage, which nobody makes where nobody reads them."""
+    if log.isEnabledFor(logging.INFO):
+        for line in tell(*what):
+            log.info("%s", line)
 
 
 def _begin(group, run, workers, other):

@@ -137,7 +137,8 @@ def match_or_fail(task):
         stored = _stored_for(task.solution, frame)
         if sources is None:
             sources = measure_sources(frame, task.settings)
-        return match_frame(frame, task.catalog, task.settings, sources=sources, solution=stored)
+        found = match_frame(frame, task.catalog, task.settings, sources=sources, solution=stored)
+        return replace(found, seconds=time.perf_counter() - began)
     except WPDCError as err:
         error = err
     except Exception as problem:  # noqa: BLE001  One frame is not to end the run of all.

@@ -11,6 +11,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.hints import hint_of_frame
 from wpdc_gwcs.cli.inputs import expand_paths
 from wpdc_gwcs.cli.options import (
     Blind,
@@ -41,7 +42,7 @@ from wpdc_gwcs.cli.options import (
 )
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.cli.report import write_page
-from wpdc_gwcs.exceptions import FrameFailure, InputError, InternalError
+from wpdc_gwcs.exceptions import InputError, InternalError
 
 log = logging.getLogger("wpdc_gwcs.cli")
 
@@ -343,10 +344,8 @@ def calibrate_command(
                 "%d more frames are %s: see the column 'reason' of %s",
                 len(found) - _MOST_LINES, what, output / "summary.ecsv",
             )  # fmt: skip
-    refused = [f.source for f in loaded if isinstance(run.failures.get(f.name), FrameFailure)]
-    if refused and not quiet:
-        given = f"{shlex.quote(refused[0])} --catalog {shlex.quote(catalog)}"
-        typer.echo(f"stage by stage, and what to try: wpdc explain {given} --output why.png")
+    if not quiet:
+        tell_hints(run.failures, {f.name: f.source for f in loaded}, catalog=catalog, wcs=wcs)
     if any(isinstance(error, InputError) for error in run.failures.values()):
         raise typer.Exit(2)
     if run.failures:
@@ -389,6 +388,28 @@ def stored_solutions(paths):
     if not found:
         return None
     return single if len(paths) == 1 and single is not None else found
+
+
+def tell_hints(failures, sources, **given):
+    """Print what to try with the frames that failed, once for each kind of reason.
+
+    Parameters
+    ----------
+    failures : dict
+        Frame name to error.
+    sources : dict
+        Frame name to its path.
+    **given
+        As for `hint_of_frame`.
+    """
+    told = set()
+    for name, error in failures.items():
+        hint = hint_of_frame(error, sources[name], **given)
+        # Hints of one kind differ by the frame alone.
+        kind = None if hint is None else hint.replace(shlex.quote(sources[name]), "")
+        if kind is not None and kind not in told:
+            told.add(kind)
+            typer.echo(f"try: {hint}")
 
 
 def print_changes(run):
