@@ -64,7 +64,20 @@ class DetectionError(FrameFailure):
 
 
 class MatchError(FrameFailure):
-    """The sources could not be matched to the reference catalog with sufficient evidence."""
+    """The sources could not be matched to the reference catalog with sufficient evidence.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong.
+    found : dict, optional
+        Of a match that is further from the header than is allowed: ``shift`` (px), ``rotation``
+        (deg) and ``scale`` (factor) from the header to it.
+    """
+
+    def __init__(self, message="", *, found=None):
+        super().__init__(message)
+        self.found = found
 
 
 class FitError(FrameFailure):

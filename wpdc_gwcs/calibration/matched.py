@@ -144,7 +144,8 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
             blind=settings.blind,
         )
     except MatchError as err:
-        raise MatchError(f"{err} ({left_out(rules_of(sources, frame, settings))})") from err
+        counts = left_out(rules_of(sources, frame, settings))
+        raise MatchError(f"{err} ({counts})", found=err.found) from err
     return MatchedFrame(
         name=frame.name,
         source=frame.source,
