@@ -28,6 +28,7 @@ from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
 from wpdc_gwcs.selection import left_out
+from wpdc_gwcs.solution import has_inverse
 from wpdc_gwcs.stages import announce
 
 __all__ = [
@@ -42,9 +43,6 @@ __all__ = [
 ]
 
 _ERROR_FLOOR = 0.01  # px
-
-# Scales of the two axes of a header that differ by more are no scales.
-_MOST_CONDITION = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +210,7 @@ def _start(frame, solution):
     """Linear WCS about which a frame is matched."""
     point = header_reference_point(frame) if solution is None else solution.crpix
     start = linear_wcs(frame.wcs, point)
-    if not np.linalg.cond(start.cd) < _MOST_CONDITION:
+    if not has_inverse(start.cd):
         raise MatchError(
             f"{frame.source}: the starting WCS must be invertible, its matrix is "
             f"{start.cd.tolist()} deg / px at pixel {point.tolist()}"

@@ -109,9 +109,11 @@ def _peaks(image, rms):
     """Rows and columns of the pixels tested; at the rim, neighbors are missing."""
     rows, columns = [], []
     for first, high in high_pixels(image[1:-1], rms[1:-1], _MIN_PEAK):
-        y, x = np.nonzero(high[:, 1:-1])
+        # Few of many, which are found several times as fast in one row.
+        high[:, 0] = high[:, -1] = False
+        y, x = np.divmod(np.flatnonzero(high), high.shape[1])
         rows.append(y + first + 1)
-        columns.append(x + 1)
+        columns.append(x)
     return np.concatenate(rows), np.concatenate(columns)
 
 
