@@ -69,7 +69,7 @@ def monitor_command(
     of single exposures have taken is put back.  Of a camera every detector is tested, and
     --false-alarm is shared by all detectors and periods.
     """
-    from wpdc_gwcs.calibration.results import file_stem
+    from wpdc_gwcs.calibration.names import file_stem
     from wpdc_gwcs.io import write_table
 
     if plots is not None:
