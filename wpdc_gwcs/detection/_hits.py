@@ -97,7 +97,7 @@ def mask_hits(background, *, overwrite=False):
         hit |= _sharper(peak, pairs, noise, np.clip(size[1], _SHARPEST, _BROADEST))
     if not hit.any():
         return background
-    log.info("%d pixels masked as hits", np.count_nonzero(hit))
+    log.debug("%d pixels masked as hits", np.count_nonzero(hit))
     result = background if overwrite else background.copy()
     mask = np.zeros(image.shape, bool) if result.mask is None else result.mask
     mask[y[hit], x[hit]] = True
