@@ -249,7 +249,7 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
     x, y, flux = (np.array(v, dtype=float) for v in stars)
     shares = profile.shares(x, y)
     flux = np.maximum(flux, 1e-6)
-    x0, y0 = x.copy(), y.copy()
+    x0, y0, positions = x.copy(), y.copy(), noise.of_positions
     converged = np.zeros(len(x), bool)
     active = np.arange(len(x))
     for _ in range(_MAX_ITERATIONS):
@@ -257,7 +257,7 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
             x[active] - xc[active], y[active] - yc[active], half, shares[active]
         )
         step, *_rest = _normal_step(
-            basis, flux[active], pixels[active], use[active], sky.take(active), noise
+            basis, flux[active], pixels[active], use[active], sky.take(active), positions
         )
         shift = np.clip(step[:, :2], -_MAX_STEP, _MAX_STEP)
         x[active] += shift[:, 0]
@@ -276,7 +276,9 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
         # Slow but close enough: what is left is far below the error.
         converged[active] = np.abs(shift[~done & ~away]).max(axis=1, initial=0) < 3e-3
     basis = profile.evaluate(x - xc, y - yc, half, shares)
-    _step, covariance, chi2 = _normal_step(basis, flux, pixels, use, sky, noise)
+    _step, covariance, chi2 = _normal_step(basis, flux, pixels, use, sky, positions)
+    if positions.mismatch != noise.mismatch:
+        _step, _covariance, chi2 = _normal_step(basis, flux, pixels, use, sky, noise)
     positive = np.einsum("sii->si", covariance).min(axis=1, initial=np.inf) > 0
     valid = converged & positive & np.isfinite(chi2)
     covariance[~valid] = np.nan

@@ -195,6 +195,9 @@ def fit_centroids(
         \sigma^2 = \sigma_\mathrm{sky}^2 + f \psi / g
                    + \epsilon^2 f^2 \psi \psi_\mathrm{max} .
 
+    For positions and their errors :math:`\epsilon` is that part which is odd about the star, for
+    :math:`\chi^2` all of it.
+
     The errors are those of all stars fitted together: of the normal matrix with the neighbors
     eliminated, times :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1, and what is wrong in
     the models of the neighbors besides.  Where neighbors cost a star more than half of its error
@@ -350,13 +353,13 @@ def measure_noise(data, sources, epsf, *, error=None):
     fwhm = _typical_fwhm(sources)
     stars = _stars_of(sources, unit)
     quality = select_sources(sources)
-    bins, n = noise_bins(field, from_photutils(epsf), stars, quality, fwhm, None)
+    bins, clean, _ = noise_bins(field, from_photutils(epsf), stars, quality, fwhm, None)
     noise = estimate_noise(bins)
     gain = np.nan
     if bins is not None:
         photons = np.median(noise.inverse_gain * bins.photons / bins.measured)
         gain = 1 / (noise.inverse_gain * unit) if photons > _LEAST_PHOTONS else np.nan
-    return StarNoise(float(gain), least_gain(bins) / unit, noise.mismatch, n)
+    return StarNoise(float(gain), least_gain(bins) / unit, noise.mismatch, len(clean.x))
 
 
 def _fitted_table(sources, fits, shift, flags, fwhm, unit):

@@ -4,7 +4,7 @@ import numpy as np
 
 from wpdc_gwcs.centroids._profile import Profile
 
-__all__ = ["blur_modes", "mode_profiles", "reduced_normal"]
+__all__ = ["blur_modes", "mode_profiles", "odd_modes", "reduced_normal"]
 
 # Pixels further off the model than this many sigma weigh as if they were there.
 _HUBER = 3.0
@@ -25,28 +25,46 @@ def blur_modes(coefficients, scale):
     list of (M, M) ndarray
         Coefficients of the second derivatives and of the squared Laplacian, in units of scale.
     """
-
-    def along(c, axis):
-        padded = np.pad(c, [(1, 1) if a == axis else (0, 0) for a in (0, 1)])
-        low, high = (np.take(padded, np.arange(n, n + c.shape[axis]), axis) for n in (0, 2))
-        return low, high
-
-    def second(c, axis):
-        low, high = along(c, axis)
-        return (low - 2 * c + high) * scale**2
-
-    def first(c, axis):
-        low, high = along(c, axis)
-        return 0.5 * (high - low) * scale
-
-    xx, yy = second(coefficients, 1), second(coefficients, 0)
+    xx, yy = _second(coefficients, 1, scale), _second(coefficients, 0, scale)
     laplacian = xx + yy
     return [
         xx / 8,
-        first(first(coefficients, 0), 1) / 4,
+        _first(_first(coefficients, 0, scale), 1, scale) / 4,
         yy / 8,
-        (second(laplacian, 0) + second(laplacian, 1)) / 128,
+        (_second(laplacian, 0, scale) + _second(laplacian, 1, scale)) / 128,
     ]
+
+
+def odd_modes(coefficients, scale):
+    """Change of a profile by a little more light on one side, in the directions there are.
+
+    Parameters
+    ----------
+    coefficients, scale
+        As for `blur_modes`.
+
+    Returns
+    -------
+    list of (M, M) ndarray
+        Coefficients of the four third derivatives, in units of scale.
+    """
+    xx, yy = _second(coefficients, 1, scale), _second(coefficients, 0, scale)
+    return [_first(c, axis, scale) / 16 for c in (xx, yy) for axis in (1, 0)]
+
+
+def _neighbors(c, axis):
+    padded = np.pad(c, [(1, 1) if a == axis else (0, 0) for a in (0, 1)])
+    return (np.take(padded, np.arange(n, n + c.shape[axis]), axis) for n in (0, 2))
+
+
+def _first(c, axis, scale):
+    low, high = _neighbors(c, axis)
+    return 0.5 * (high - low) * scale
+
+
+def _second(c, axis, scale):
+    low, high = _neighbors(c, axis)
+    return (low - 2 * c + high) * scale**2
 
 
 def mode_profiles(modes, oversampling):

@@ -8,8 +8,8 @@ import numpy as np
 from wpdc_gwcs.centroids._blends import judge_profiles, weigh_neighbors
 from wpdc_gwcs.centroids._build import isolated
 from wpdc_gwcs.centroids._fit import StarFits, Stars, fit_radius, fit_stars, star_like
-from wpdc_gwcs.centroids._modes import blur_modes, mode_profiles
-from wpdc_gwcs.centroids._noise import Noise, bin_noise, estimate_noise
+from wpdc_gwcs.centroids._modes import blur_modes, mode_profiles, odd_modes
+from wpdc_gwcs.centroids._noise import Noise, bin_noise, bin_odd_noise, estimate_noise
 from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EXTENDED, FLAG_SATURATED
 from wpdc_gwcs.threads import one_blas_thread
 
@@ -53,8 +53,10 @@ def noise_bins(field, profile, stars, quality, fwhm, gain, *, own=None):
     -------
     bins : NoiseBins or None
         As from `bin_noise`.
-    n : int
-        How many stars they are of.
+    clean : Stars
+        The stars that they are of, as fitted.
+    own : Stars or None
+        Their models that were subtracted.
     """
     radius = fit_radius(fwhm)
     noise = Noise(0.0 if gain is None else 1 / gain)
@@ -65,19 +67,25 @@ def noise_bins(field, profile, stars, quality, fwhm, gain, *, own=None):
     rows = rows[np.argsort(stars.flux[rows])[::-1][:_MAX_STARS]]
     own = None if own is None else own.take(rows)
     fits = fit_stars(field, profile, noise, stars.take(rows), radius=radius, own=own)
-    clean = star_like(fits.stars.flux, fits.chi2, fits.valid)
+    alike = star_like(fits.stars.flux, fits.chi2, fits.valid)
+    clean, own = fits.stars.take(alike), None if own is None else own.take(alike)
     # A star that is a little broader or sharper than others has no worse position.
     blur = blur_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)
-    bins = bin_noise(
-        field,
-        profile,
-        noise,
-        fits.stars.take(clean),
-        radius=radius,
-        modes=mode_profiles(blur[:3], profile.oversampling),
-        own=None if own is None else own.take(clean),
+    modes = mode_profiles(blur[:3], profile.oversampling)
+    bins = bin_noise(field, profile, noise, clean, radius=radius, modes=modes, own=own)
+    return bins, clean, own
+
+
+def _with_asymmetry(noise, field, profile, stars, own, fwhm):
+    """Noise that knows what part of the profile's error is odd about the star."""
+    odd = odd_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)
+    modes = mode_profiles(odd, profile.oversampling)
+    radius = fit_radius(fwhm)
+    bins = bin_odd_noise(field, profile, noise, stars, modes, radius=radius, own=own)
+    # The photons are in the units of these bins.
+    return (
+        noise if bins is None else replace(noise, asymmetry=estimate_noise(bins, np.inf).mismatch)
     )
-    return bins, int(clean.sum())
 
 
 @one_blas_thread
@@ -111,8 +119,9 @@ def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
         Noise of the pixels.
     """
     radius = fit_radius(fwhm)
-    bins, _ = noise_bins(scene.field, profile, stars, quality, fwhm, gain, own=scene.own)
+    bins, *clean = noise_bins(scene.field, profile, stars, quality, fwhm, gain, own=scene.own)
     noise = estimate_noise(bins, gain)
+    noise = _with_asymmetry(noise, scene.field, profile, *clean, fwhm)
     log.info("noise of the fits: %s", noise)
     fits, rows = StarFits.unfitted(stars), np.arange(len(stars.x))
     if refit:
@@ -167,7 +176,13 @@ def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
     all_light = own._replace(flux=np.where(fitted, own.flux, np.maximum(start.flux, 0)))
     alone = np.where(fitted[:, None, None], fits.covariance, np.nan)
     joint, shift = weigh_neighbors(
-        field, profile, noise, all_light, alone, radius, np.where(fitted, unsure, _NO_MODEL)
+        field,
+        profile,
+        noise.of_positions,
+        all_light,
+        alone,
+        radius,
+        np.where(fitted, unsure, _NO_MODEL),
     )
     before, after = (np.sqrt(c[:, 0, 0] + c[:, 1, 1]) for c in (alone, joint))
     error = np.hypot(after, shift)
