@@ -64,7 +64,7 @@ def test_stars_of_many_widths_have_the_errors_of_that():
     """The fits of undersampled stars by a profile of another width depend on the pixel phase."""
     error, stated, limit = measure(2, width=0.03)
     assert scatter(error / limit) > 2.5
-    assert scatter(error / stated) == pytest.approx(1, abs=0.25)
+    assert scatter(error / stated) == pytest.approx(1, abs=0.35)
 
 
 def test_stars_that_lean_have_errors_of_that():

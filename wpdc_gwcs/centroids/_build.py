@@ -13,6 +13,7 @@ from wpdc_gwcs.centroids._noise import bin_noise, estimate_noise
 from wpdc_gwcs.centroids._profile import (
     Profile,
     moffat_samples,
+    shift_matrix,
     spline_coefficients,
     spline_taps,
 )
@@ -383,18 +384,7 @@ def _centered(profile, fwhm):
             shift += step
             if np.abs(step).max() < 1e-7:
                 break
-        matrix_x, matrix_y = (_shift_matrix(size, over * s) for s in shift)
+        matrix_x, matrix_y = (shift_matrix(size, over * s) for s in shift)
         grid = matrix_y @ coefficients @ matrix_x.T
         moved.append(grid * over**2 / grid.sum())
     return replace(profile, coefficients=spline_coefficients(np.stack(moved)))
-
-
-def _shift_matrix(size, shift):
-    """Matrix from spline coefficients to values on the grid moved by a shift in grid steps."""
-    base, taps, _ = spline_taps(np.arange(size) + shift)
-    column = base[:, None] + np.arange(-1, 3)
-    inside = (column >= 0) & (column < size)
-    matrix = np.zeros((size, size))
-    row = np.broadcast_to(np.arange(size)[:, None], column.shape)
-    matrix[row[inside], column[inside]] = taps[inside]
-    return matrix

@@ -8,7 +8,15 @@ from scipy.ndimage import spline_filter, uniform_filter1d
 
 from wpdc_gwcs import kernels
 
-__all__ = ["Models", "Profile", "cutouts", "moffat_samples", "spline_coefficients", "spline_taps"]
+__all__ = [
+    "Models",
+    "Profile",
+    "cutouts",
+    "moffat_samples",
+    "shift_matrix",
+    "spline_coefficients",
+    "spline_taps",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,6 +289,30 @@ def moffat_samples(shape, half, oversampling):
         :, oversampling * fine : -oversampling * fine : fine
     ]
     return samples / samples.sum() * oversampling**2
+
+
+def shift_matrix(size, shift):
+    """Make the matrix from spline coefficients to values on a grid that is moved.
+
+    Parameters
+    ----------
+    size : int
+        Number of coefficients.
+    shift : float
+        Grid steps by which the grid is moved.
+
+    Returns
+    -------
+    (size, size) ndarray
+        Matrix.
+    """
+    base, taps, _ = spline_taps(np.arange(size) + shift)
+    column = base[:, None] + np.arange(-1, 3)
+    inside = (column >= 0) & (column < size)
+    matrix = np.zeros((size, size))
+    row = np.broadcast_to(np.arange(size)[:, None], column.shape)
+    matrix[row[inside], column[inside]] = taps[inside]
+    return matrix
 
 
 def cutouts(image, xc, yc, half):

@@ -26,6 +26,8 @@ MAX_CHI2 = 4.0
 # Relative error of a neighbor's light beside its core: what any PSF is known to at best, what that
 # of a saturated star is, whose flux comes from its wings, and that of a source that has no model.
 _LEAST_ERROR, _SATURATED_ERROR, _NO_MODEL = 0.02, 0.2, 1.0
+# Signal-to-noise ratio of stars from which companions under them show.
+_LEAST_SNR = 15.0
 # A star is blended where its neighbors cost it more than this many times the error it would have
 # alone, and more than so many px.
 _MAX_COST, _TOLERATED_COST = 1.5, 0.01
@@ -171,7 +173,11 @@ def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
     radius, field, own = fit_radius(fwhm), scene.field, scene.drawn
     fitted = own.flux > 0
     clean = (flags == 0) & star_like(own.flux, fits.chi2, fitted, limit=MAX_CHI2)
-    broad, excess = judge_profiles(field, profile, noise, own, clean, fwhm, radius, subtracted=True)
+    shown = own.flux > _LEAST_SNR * np.sqrt(np.where(fitted, fits.covariance[:, 2, 2], np.inf))
+    judged = own._replace(flux=np.where(shown, own.flux, 0.0))
+    broad, excess = judge_profiles(
+        field, profile, noise, judged, clean, fwhm, radius, subtracted=True
+    )
     unsure = np.where(flags & FLAG_SATURATED, _SATURATED_ERROR, max(_LEAST_ERROR, noise.mismatch))
     all_light = own._replace(flux=np.where(fitted, own.flux, np.maximum(start.flux, 0)))
     alone = np.where(fitted[:, None, None], fits.covariance, np.nan)
