@@ -3,13 +3,12 @@
 import numpy as np
 from scipy.spatial import KDTree
 
-from wpdc_gwcs.centroids._modes import blur_modes, companions, odd_modes, reduced_normal
+from wpdc_gwcs.centroids._joint import cross_products, pairs_that_share
+from wpdc_gwcs.centroids._modes import blur_modes, companions, inverses, odd_modes, reduced_normal
 
 __all__ = ["judge_profiles", "weigh_neighbors"]
 
-# Neighbors that share pixels with a fit are at most this far, in radii of the fits.
-_REACH = 1.8
-# Pairs at a time: bounds the memory for their pixels.
+# Stars at a time: bounds the memory for their pixels.
 _CHUNK = 4000
 
 # Significance in sigma of the companion that is the most significant one, which two stars in a
@@ -59,20 +58,12 @@ def weigh_neighbors(field, profile, noise, stars, covariance, radius, unsure):
     :math:`(N_{ii}^{-1} N_{ij})_{xf} f_j`.
     """
     joint, shift = covariance.copy(), np.zeros(len(stars.x))
-    pairs = KDTree(np.column_stack([stars.x, stars.y])).query_pairs(
-        _REACH * radius, output_type="ndarray"
-    )
     fitted = np.isfinite(covariance).all(axis=(1, 2))
-    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    pairs = pairs_that_share(stars, radius)
     if len(pairs) == 0:
         return joint, shift
     i, j = pairs.T
-    cross = np.concatenate(
-        [
-            _products(field, profile, noise, stars.take(i[k]), stars.take(j[k]), radius)
-            for k in (slice(n, n + _CHUNK) for n in range(0, len(i), _CHUNK))
-        ]
-    )
+    cross = cross_products(field, profile, noise, stars, pairs, radius)
     back = np.roll(np.arange(len(i)), len(i) // 2)
     known = fitted[i]
     moved = covariance[i[known]] @ cross[known][:, :, 2:]
@@ -86,21 +77,6 @@ def weigh_neighbors(field, profile, noise, stars, covariance, radius, unsure):
     normal = np.linalg.inv(covariance[rows]) - 0.5 * (loss[rows] + loss[rows].transpose(0, 2, 1))
     joint[rows] = _inverse(normal)
     return joint, np.sqrt(shift)
-
-
-def _products(field, profile, noise, stars, others, radius):
-    """Weighted products (n, 3, 3) of the derivatives of stars and others, in the stars' pixels."""
-    half = int(np.ceil(radius))
-    xc, yc, _, use, sky = field.cut(stars, half, radius)
-    sides = []
-    for side in (stars, others):
-        shares = profile.shares(side.x, side.y)
-        value, by_x, by_y = profile.evaluate(side.x - xc, side.y - yc, half, shares)
-        flux = side.flux[:, None]
-        sides.append(np.stack([flux * by_x, flux * by_y, value], axis=1))
-    model = stars.flux[:, None] * sides[0][:, 2]
-    weight = use / noise.variance(sky, model)
-    return (sides[0] * weight[:, None]) @ sides[1].transpose(0, 2, 1)
 
 
 def _inverse(normal):
@@ -163,7 +139,7 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
         for n in range(0, len(rows), _CHUNK)
     ]
     left, right, freedom = (np.concatenate(column) for column in zip(*parts, strict=True))
-    covariance = np.linalg.pinv(left)
+    covariance = inverses(left)
     amplitude = np.einsum("sij,sj->si", covariance, right)
     before = np.einsum("si,sij,sj->s", amplitude, left, amplitude)
     best = clean[np.argsort(covariance[clean].trace(axis1=1, axis2=2))]
@@ -172,7 +148,7 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     amplitude -= common
     narrower = amplitude[best] @ changes.mean(axis=1) <= 0
     differences = _differences(amplitude[best], covariance[best], narrower)
-    weight = np.linalg.pinv(covariance + unsure + (1 + _MEDIAN_COST / _NEAREST) * differences)
+    weight = inverses(covariance + unsure + (1 + _MEDIAN_COST / _NEAREST) * differences)
     after = np.einsum("si,sij,sj->s", amplitude, weight, amplitude)
     excess[rows] = (before - after) / freedom
     pushed = weight @ changes
@@ -196,11 +172,14 @@ def _normal(field, profile, noise, stars, modes, *, radius, subtracted):
 
 def _common(stars, amplitude, covariance, best):
     """Median amplitudes of the nearest of the best measured stars, and their covariance."""
-    tree = KDTree(np.column_stack([stars.x[best], stars.y[best]]))
+    places = np.column_stack([stars.x, stars.y])
+    tree = KDTree(places[best])
     k = min(_NEAREST, len(best))
-    near = best[tree.query(np.column_stack([stars.x, stars.y]), k=k)[1]]
+    near = best[tree.query(places[best], k=k)[1]]
     noise = _MEDIAN_COST / k * covariance[near].mean(axis=1)
-    return np.median(amplitude[near], axis=1), noise
+    # Those of the best star next to it, which differ little from its own.
+    nearest = tree.query(places)[1]
+    return np.median(amplitude[near], axis=1)[nearest], noise[nearest]
 
 
 def _differences(amplitude, covariance, narrower):

@@ -163,7 +163,8 @@ def fit_centroids(
     error : float or (ny, nx) array_like, optional
         Standard deviation of the background; only for a plain array.
     passes : int, optional
-        Number of rounds; from the second on, the neighbors' models are subtracted.
+        Number of rounds; from the second on, the neighbors' models are subtracted, and stars that
+        share pixels are improved together.
     refit : bool, optional
         The sources have been fitted before, or found beside such: neighbors are subtracted from
         the first round on.  A source on the flank of a brighter one needs that.

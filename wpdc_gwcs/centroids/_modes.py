@@ -4,10 +4,13 @@ import numpy as np
 
 from wpdc_gwcs.centroids._profile import Profile, shift_matrix, spline_coefficients
 
-__all__ = ["blur_modes", "companions", "mode_profiles", "odd_modes", "reduced_normal"]
+__all__ = ["blur_modes", "companions", "inverses", "mode_profiles", "odd_modes", "reduced_normal"]
 
 # Pixels further off the model than this many sigma weigh as if they were there.
 _HUBER = 3.0
+
+# Added to the unit diagonal of normal matrices, far below what is known of anything.
+_RIDGE = 1e-9
 
 # Places of companions: distances in FWHM, and directions.
 _DISTANCES, _N_ANGLES = (0.6, 0.9), 12
@@ -117,6 +120,27 @@ def mode_profiles(modes, oversampling):
     return [Profile(mode.reshape(1, *mode.shape[-2:]), oversampling, zero, zero) for mode in modes]
 
 
+def inverses(normal):
+    """Invert normal matrices, of which some may be singular.
+
+    Parameters
+    ----------
+    normal : (N, K, K) ndarray
+        Matrices.
+
+    Returns
+    -------
+    (N, K, K) ndarray
+        Their inverses, large where nothing is known.
+    """
+    diagonal = np.einsum("sii->si", normal)
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = normal / scale[:, :, None] / scale[:, None, :]
+    return np.linalg.inv(scaled + _RIDGE * np.eye(scale.shape[1])) / (
+        scale[:, :, None] * scale[:, None, :]
+    )
+
+
 def reduced_normal(field, profile, noise, stars, modes, radius, *, subtracted=False, robust=True):
     """Set up normal equations for the amplitudes of modes, free of position and flux.
 
@@ -156,6 +180,6 @@ def reduced_normal(field, profile, noise, stars, modes, radius, *, subtracted=Fa
     both = np.concatenate([own, common, residual[:, None]], axis=1)
     normal = (both[:, :-1] * weight[:, None]) @ both.transpose(0, 2, 1)
     # Positions and fluxes are eliminated star by star.
-    solved = np.linalg.pinv(normal[:, :3, :3]) @ normal[:, :3, 3:]
+    solved = inverses(normal[:, :3, :3]) @ normal[:, :3, 3:]
     reduced = normal[:, 3:, 3:] - normal[:, 3:, :3] @ solved
     return reduced[:, :, :-1], reduced[:, :, -1]

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from wpdc_gwcs.centroids._modes import inverses
+
 __all__ = ["Noise", "NoiseBins", "bin_noise", "bin_odd_noise", "estimate_noise", "least_gain"]
 
 # Error of the profile below which nobody's data can tell.
@@ -116,7 +118,7 @@ def bin_noise(field, profile, noise, stars, *, radius, modes=(), own=None):
     good = use.sum(axis=1) >= 2 * n
     normal[~good] = np.eye(n)
     # A fit takes part of the scatter away, most where few pixels decide: the leverage.
-    inverse = np.linalg.pinv(normal)
+    inverse = inverses(normal)
     leverage = weight * np.einsum("sip,sij,sjp->sp", jacobian, inverse, jacobian)
     residual = pixels - model
     if own:
@@ -176,12 +178,10 @@ def bin_odd_noise(field, profile, noise, stars, modes, *, radius, own=None):
     odd = flux[:, None] * np.stack(odd, axis=1)
     weighted = fitted * weight[:, None]
     normal = weighted @ fitted.transpose(0, 2, 1)
-    odd -= (np.linalg.pinv(normal) @ (weighted @ odd.transpose(0, 2, 1))).transpose(
-        0, 2, 1
-    ) @ fitted
+    odd -= (inverses(normal) @ (weighted @ odd.transpose(0, 2, 1))).transpose(0, 2, 1) @ fitted
     weighted = odd * weight[:, None]
     left = weighted @ odd.transpose(0, 2, 1)
-    inverse = np.linalg.pinv(left)
+    inverse = inverses(left)
     right = (weighted @ (pixels - model)[:, :, None])[:, :, 0]
     square = np.maximum(model, 0) * model.max(axis=1, keepdims=True)
     error = (weighted * square[:, None]) @ weighted.transpose(0, 2, 1)

@@ -8,6 +8,7 @@ import numpy as np
 from wpdc_gwcs.centroids._blends import judge_profiles, weigh_neighbors
 from wpdc_gwcs.centroids._build import isolated
 from wpdc_gwcs.centroids._fit import StarFits, Stars, fit_radius, fit_stars, star_like
+from wpdc_gwcs.centroids._joint import joint_step
 from wpdc_gwcs.centroids._modes import blur_modes, mode_profiles, odd_modes
 from wpdc_gwcs.centroids._noise import Noise, bin_noise, bin_odd_noise, estimate_noise
 from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EXTENDED, FLAG_SATURATED
@@ -26,6 +27,9 @@ MAX_CHI2 = 4.0
 # Relative error of a neighbor's light beside its core: what any PSF is known to at best, what that
 # of a saturated star is, whose flux comes from its wings, and that of a source that has no model.
 _LEAST_ERROR, _SATURATED_ERROR, _NO_MODEL = 0.02, 0.2, 1.0
+# Steps together before any star is fitted again: a companion that was found in what a fit had left
+# of it would lose its place beside a star that has taken half of its light.
+_FIRST_STEPS = 2
 # Signal-to-noise ratio of stars from which companions under them show.
 _LEAST_SNR = 15.0
 # A star is blended where its neighbors cost it more than this many times the error it would have
@@ -127,17 +131,41 @@ def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
     log.info("noise of the fits: %s", noise)
     fits, rows = StarFits.unfitted(stars), np.arange(len(stars.x))
     if refit:
-        scene.draw(_modelled(fits, stars, fwhm), radius)
-    for k in range(passes):
-        start = _modelled(fits, stars, fwhm).take(rows) if k or refit else stars
-        own = None if scene.own is None else scene.own.take(rows)
-        again = fit_stars(scene.field, profile, noise, start, radius=radius, own=own)
-        fits = fits.updated(rows, again)
-        rows = scene.draw(_modelled(fits, stars, fwhm), radius)
+        touched = scene.draw(_modelled(fits, stars, fwhm), radius)
+        for _ in range(_FIRST_STEPS):
+            fits, touched = _step_together(scene, profile, noise, fits, stars, touched, fwhm)
+    start = _modelled(fits, stars, fwhm) if refit else stars
+    fits = _fit_again(scene, profile, noise, start, rows, radius)
+    rows, moved = scene.draw(_modelled(fits, stars, fwhm), radius), []
+    for k in range(1, passes):
         log.debug("round %d: the light beside %d stars has changed", k, len(rows))
         if len(rows) == 0:
             break
+        moved.append(rows)
+        fits, rows = _step_together(scene, profile, noise, fits, stars, rows, fwhm)
+    if moved:
+        rows = np.unique(np.concatenate([rows, *moved]))
+        start = _modelled(fits, stars, fwhm).take(rows)
+        fits = fits.updated(rows, _fit_again(scene, profile, noise, start, rows, radius))
+        scene.draw(_modelled(fits, stars, fwhm), radius)
     return fits, noise
+
+
+def _step_together(scene, profile, noise, fits, start, rows, fwhm):
+    """Fits after a step of some stars together, and the rows beside which that changes light."""
+    radius = fit_radius(fwhm)
+    rows = rows[scene.drawn.flux[rows] > 0]
+    if len(rows) == 0:
+        return fits, rows
+    step = joint_step(scene.field, profile, noise.of_positions, scene.drawn, rows, radius)
+    fits = fits.moved(rows, step)
+    return fits, scene.draw(_modelled(fits, start, fwhm), radius)
+
+
+def _fit_again(scene, profile, noise, start, rows, radius):
+    """Fits of some stars, the others where they are."""
+    own = None if scene.own is None else scene.own.take(rows)
+    return fit_stars(scene.field, profile, noise, start, radius=radius, own=own)
 
 
 @one_blas_thread
