@@ -8,7 +8,7 @@ from scipy.linalg import LinAlgError, solveh_banded
 from scipy.spatial import KDTree
 
 from wpdc_gwcs.centroids._fit import fit_stars, star_like
-from wpdc_gwcs.centroids._modes import blur_modes, reduced_normal
+from wpdc_gwcs.centroids._modes import blur_modes, odd_modes, reduced_normal
 from wpdc_gwcs.centroids._noise import bin_noise, estimate_noise
 from wpdc_gwcs.centroids._profile import (
     Profile,
@@ -218,7 +218,7 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
     return profile, fits.stars.take(fits.valid), noise
 
 
-def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
+def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree, lean=False):
     r"""Let the width and the shape of a profile vary smoothly over the detector.
 
     Parameters
@@ -235,6 +235,8 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
         Radius in px of the pixels used.
     degree : int
         Degree of the polynomials in position.
+    lean : bool, optional
+        Whether its asymmetry may vary as well.
 
     Returns
     -------
@@ -250,10 +252,14 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
         \psi(u, v; X, Y) = \psi + a_1 \psi_{uu} + a_2 \psi_{uv} + a_3 \psi_{vv}
                             + a_4 \nabla^4 \psi
 
-    with polynomials :math:`a_k(X, Y)`.  None of these has a first moment: the meaning of the
-    position stays the same all over the detector.
+    with polynomials :math:`a_k(X, Y)`.  Coma, which grows off the axis of any telescope, changes
+    the third derivatives.  None of these has a first moment: the meaning of the position stays the
+    same all over the detector.
     """
-    modes = blur_modes(profile.coefficients[0], fwhm * profile.oversampling)
+    scale = fwhm * profile.oversampling
+    modes = blur_modes(profile.coefficients[0], scale)
+    if lean:
+        modes += odd_modes(profile.coefficients[0], scale)
     left, right = reduced_normal(field, profile, noise, stars, modes, radius)
     ny, nx = field.image.shape
     terms = _polynomial_terms(stars.x / nx, stars.y / ny, degree)

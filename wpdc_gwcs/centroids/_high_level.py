@@ -31,6 +31,9 @@ __all__ = [
 _LEAST_PHOTONS = 0.1
 # Reduced chi square up to which the formal errors stand; beyond, they grow with its root.
 _TOLERATED_CHI2 = 1.5
+# Share of the wobble of the center of light with the place in the pixel that one frame cannot tell:
+# by so much it depends on the kind of profile that the PSF is learnt from.
+_UNKNOWN_WOBBLE = 0.3
 
 
 def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0, vary="auto"):
@@ -201,9 +204,12 @@ def fit_centroids(
 
     The errors are those of all stars fitted together: of the normal matrix with the neighbors
     eliminated, times :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1, and what is wrong in
-    the models of the neighbors besides.  Where neighbors cost a star more than half of its error
-    and more than 0.01 px, `wpdc_gwcs.detection.FLAG_BLENDED` is set, and it is cleared elsewhere;
-    where the profile is broader than those of other stars, `wpdc_gwcs.detection.FLAG_EXTENDED`.
+    the models of the neighbors besides, and 0.3 of the wobble of the center of light with the place
+    in the pixel, which matters below a FWHM of 1.5 px.
+
+    Where neighbors cost a star more than half of its error and more than 0.01 px,
+    `wpdc_gwcs.detection.FLAG_BLENDED` is set, and it is cleared elsewhere; where two stars describe
+    a profile better than one, `wpdc_gwcs.detection.FLAG_EXTENDED`.
 
     Examples
     --------
@@ -247,6 +253,7 @@ def fit_centroids(
     shift = np.zeros(len(stars.x))
     if judge:
         fits, shift, flags = judge_neighbors(scene, profile, noise, fits, stars, flags, fwhm)
+        shift = np.hypot(shift, _UNKNOWN_WOBBLE * profile.wobble())
     return _fitted_table(sources, fits, shift, flags, fwhm, unit)
 
 

@@ -66,6 +66,26 @@ class Profile:
         c = (c[:, :-2] + 4 * c[:, 1:-1] + c[:, 2:]) / 6
         return (c[:, :, :-2] + 4 * c[:, :, 1:-1] + c[:, :, 2:]) / 6
 
+    def wobble(self):
+        r"""Find by how much the center of light moves about the star with its place in the pixel.
+
+        Returns
+        -------
+        float
+            Root mean square over all places, along one axis, in px.
+
+        Notes
+        -----
+        With :math:`\psi_x` the profile summed along the other axis, that is :math:`\sqrt 2\,
+        |\int u\, \psi_x(u)\, e^{-2 \pi i u} du|`: what light there is at one cycle per pixel.
+        """
+        samples = self.samples().mean(axis=0)
+        step = (np.arange(len(samples)) - self._center) / self.oversampling
+        wave = step * np.exp(-2j * np.pi * step) / samples.sum()
+        return float(
+            np.sqrt(np.mean([np.abs(wave @ samples.sum(axis=k)) ** 2 for k in (0, 1)]) * 2)
+        )
+
     @cached_property
     def _components(self):
         """Few grids of coefficients, and their shares (G, R) in those of all places.
