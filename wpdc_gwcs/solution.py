@@ -28,13 +28,30 @@ FARTHEST_PX = 1e9
 _MOST_CONDITION = 1e6
 
 
+def has_inverse(matrix):
+    """Tell whether a matrix is finite and has an inverse worth having.
+
+    Parameters
+    ----------
+    matrix : (2, 2) array_like of float
+        A linear map, in any units.
+
+    Returns
+    -------
+    bool
+        Whether its scales along its own axes differ by less than a million.
+    """
+    matrix = np.asarray(matrix, dtype=float)
+    return bool(np.isfinite(matrix).all() and np.linalg.cond(matrix) < _MOST_CONDITION)
+
+
 def _freeze_pointing(owner):
     """Freeze CRVAL and CD, and make sure that they are a place and a linear map."""
     crval = frozen_array(owner, "crval", shape=(2,))
     if not (abs(crval[0]) <= 360 and abs(crval[1]) <= 90):
         raise ValueError(f"crval must be RA and Dec within 360 and 90 deg, got {crval.tolist()}")
     cd = frozen_array(owner, "cd", shape=(2, 2))
-    if not np.linalg.cond(cd) < _MOST_CONDITION:
+    if not has_inverse(cd):
         raise ValueError(f"cd must have an inverse, got {cd.tolist()}")
 
 

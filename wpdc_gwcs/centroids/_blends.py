@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.spatial import KDTree
 
+from wpdc_gwcs.centroids._inverses import inverses
 from wpdc_gwcs.centroids._joint import cross_products, pairs_that_share
-from wpdc_gwcs.centroids._modes import blur_modes, companions, inverses, odd_modes, reduced_normal
+from wpdc_gwcs.centroids._modes import blur_modes, companions, odd_modes, reduced_normal
 
 __all__ = ["judge_profiles", "weigh_neighbors"]
 
@@ -142,7 +143,8 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     covariance = inverses(left)
     amplitude = np.einsum("sij,sj->si", covariance, right)
     before = np.einsum("si,sij,sj->s", amplitude, left, amplitude)
-    best = clean[np.argsort(covariance[clean].trace(axis1=1, axis2=2))]
+    size = covariance[clean].trace(axis1=1, axis2=2)
+    best = clean[np.argsort(np.where(size > 0, size, np.inf))]
     best = best[: int(np.clip(len(best) // 4, _LEAST, _BEST))]
     common, unsure = _common(stars, amplitude, covariance, best)
     amplitude -= common

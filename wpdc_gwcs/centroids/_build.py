@@ -303,7 +303,9 @@ def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
     base_x, taps_x, _ = spline_taps(center - over * (x - xc))
     base_y, taps_y, _ = spline_taps(center - over * (y - yc))
     taps = (taps_y[:, :, None] * taps_x[:, None, :]).reshape(-1, 16)
-    squares = (taps[:, :, None] * taps[:, None, :]).reshape(-1, 256)
+    # Of the symmetric products the lower half.
+    first, second = np.tril_indices(16)
+    squares = taps[:, first] * taps[:, second]
     width = 4 * size + 5
     band = np.zeros((width, size * size))
     right = np.zeros(size * size)
@@ -315,12 +317,10 @@ def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
         iy = base_y[k[0]] + step[:, None] + tap
         ix = base_x[k[0]] + step[:, None] + tap
         index = (iy[:, None, :, None] * size + ix[None, :, None, :]).reshape(-1, 16)
-        np.add.at(right, index, (weight[k] * residual[k]).T @ taps[k])
-        normal = (weight[k].T @ squares[k]).reshape(-1, 16, 16)
-        offset = index[:, :, None] - index[:, None, :]
-        lower = offset >= 0
-        column = np.broadcast_to(index[:, None, :], offset.shape)
-        np.add.at(band, (offset[lower], column[lower]), normal[lower])
+        for tile in _tiles(half, over):
+            right[index[tile]] += (weight[k][:, tile] * residual[k][:, tile]).T @ taps[k]
+            column = index[tile][:, second]
+            band[index[tile][:, first] - column, column] += weight[k][:, tile].T @ squares[k]
     prior = profile.samples().mean(axis=0)[::stride, ::stride]
     _add_prior(band, prior, fwhm, finest, over, stride**2)
     try:
@@ -329,6 +329,13 @@ def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
         return np.zeros_like(profile.coefficients[0])
     solution = solution.reshape(size, size)
     return solution if stride == 1 else _halved(_halved(solution).T).T
+
+
+def _tiles(half, over):
+    """Pixels of cut-outs, in parts in which no two have a knot in common."""
+    apart = 4 // over
+    place = np.arange((2 * half + 1) ** 2).reshape(2 * half + 1, -1)
+    return [place[i::apart, j::apart].ravel() for i in range(apart) for j in range(apart)]
 
 
 def _halved(coefficients):

@@ -2,15 +2,13 @@
 
 import numpy as np
 
+from wpdc_gwcs.centroids._inverses import inverses
 from wpdc_gwcs.centroids._profile import Profile, shift_matrix, spline_coefficients
 
-__all__ = ["blur_modes", "companions", "inverses", "mode_profiles", "odd_modes", "reduced_normal"]
+__all__ = ["blur_modes", "companions", "mode_profiles", "odd_modes", "reduced_normal"]
 
 # Pixels further off the model than this many sigma weigh as if they were there.
 _HUBER = 3.0
-
-# Added to the unit diagonal of normal matrices, far below what is known of anything.
-_RIDGE = 1e-9
 
 # Places of companions: distances in FWHM, and directions.
 _DISTANCES, _N_ANGLES = (0.6, 0.9), 12
@@ -118,27 +116,6 @@ def mode_profiles(modes, oversampling):
     """
     zero = np.zeros(1)
     return [Profile(mode.reshape(1, *mode.shape[-2:]), oversampling, zero, zero) for mode in modes]
-
-
-def inverses(normal):
-    """Invert normal matrices, of which some may be singular.
-
-    Parameters
-    ----------
-    normal : (N, K, K) ndarray
-        Matrices.
-
-    Returns
-    -------
-    (N, K, K) ndarray
-        Their inverses, large where nothing is known.
-    """
-    diagonal = np.einsum("sii->si", normal)
-    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    scaled = normal / scale[:, :, None] / scale[:, None, :]
-    return np.linalg.inv(scaled + _RIDGE * np.eye(scale.shape[1])) / (
-        scale[:, :, None] * scale[:, None, :]
-    )
 
 
 def reduced_normal(field, profile, noise, stars, modes, radius, *, subtracted=False, robust=True):

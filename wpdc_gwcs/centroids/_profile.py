@@ -11,7 +11,6 @@ from wpdc_gwcs import kernels
 __all__ = [
     "Models",
     "Profile",
-    "cutouts",
     "moffat_samples",
     "shift_matrix",
     "spline_coefficients",
@@ -333,34 +332,6 @@ def shift_matrix(size, shift):
     row = np.broadcast_to(np.arange(size)[:, None], column.shape)
     matrix[row[inside], column[inside]] = taps[inside]
     return matrix
-
-
-def cutouts(image, xc, yc, half):
-    """Cut-outs (N, n) of 2 half + 1 px squares about integer centers, and where they are inside.
-
-    Parameters
-    ----------
-    image : (ny, nx) ndarray
-        Image.
-    xc, yc : (N,) int ndarray
-        Central pixels.
-    half : int
-        Half-width of the squares.
-
-    Returns
-    -------
-    pixels : (N, n) ndarray
-        Values; at the rim those of the outermost pixels are repeated.
-    inside : (N, n) bool ndarray
-        True where the pixel is on the image.
-    """
-    ny, nx = image.shape
-    step = np.arange(-half, half + 1)
-    iy, ix = yc[:, None] + step, xc[:, None] + step
-    inside = ((iy >= 0) & (iy < ny))[:, :, None] & ((ix >= 0) & (ix < nx))[:, None, :]
-    iy, ix = np.clip(iy, 0, ny - 1), np.clip(ix, 0, nx - 1)
-    flat = (len(xc), len(step) ** 2)
-    return image[iy[:, :, None], ix[:, None, :]].reshape(flat), inside.reshape(flat)
 
 
 def _hat(position, nodes):

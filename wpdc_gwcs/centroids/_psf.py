@@ -78,7 +78,7 @@ def learn_psf(field, stars, fwhm, gain, vary):
     n = len(stars.x)
     if n < MIN_STARS:
         return None
-    log.info("effective PSF from %d stars, own error %.3f", n, noise.mismatch)
+    log.debug("effective PSF from %d stars, own error %.3f", n, noise.mismatch)
     degree = int(np.searchsorted(_STARS_FOR_DEGREE, n))
     if vary == "never" or degree == 0:
         return profile
@@ -94,7 +94,7 @@ def learn_psf(field, stars, fwhm, gain, vary):
         np.median(fit_stars(field, p, noise, stars.take(left_out), radius=radius).chi2)
         for p in tried
     ]
-    log.info("chi2 of left-out stars: constant PSF %.3f, varying blur %.3f, and lean %.3f", *chi2)
+    log.debug("chi2 of left-out stars: constant PSF %.3f, varying blur %.3f, and lean %.3f", *chi2)
     # More freedom only where it brings something.
     best = 1 if chi2[1] < _BETTER * chi2[0] else 0
     best = 2 if chi2[2] < _BETTER * chi2[best] else best
@@ -102,5 +102,5 @@ def learn_psf(field, stars, fwhm, gain, vary):
         return profile
     varying = vary_profile(field, noise, stars, profile, fwhm, **kinds[best - 1])
     varying, stars, noise = learn_profile(field, noise, stars, varying, **options)
-    log.info("own error of the varying PSF %.3f", noise.mismatch)
+    log.debug("own error of the varying PSF %.3f", noise.mismatch)
     return varying if len(stars.x) >= MIN_STARS else profile

@@ -128,7 +128,7 @@ def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
     bins, *clean = noise_bins(scene.field, profile, stars, quality, fwhm, gain, own=scene.own)
     noise = estimate_noise(bins, gain)
     noise = _with_asymmetry(noise, scene.field, profile, *clean, fwhm)
-    log.info("noise of the fits: %s", noise)
+    log.debug("noise of the fits: %s", noise)
     fits, rows = StarFits.unfitted(stars), np.arange(len(stars.x))
     if refit:
         touched = scene.draw(_modelled(fits, stars, fwhm), radius)
