@@ -610,7 +610,10 @@ NOON = Time("2020-09-24T10:21:45", scale="utc")
             (key, NOON.jd)
             for key in ("OBSJD", "JD-OBS", "JD_UTC", "JDSTART", "HJD", "JULDATE", "JD")
         ),
-        *((key, NOON.isot) for key in ("DATE_OBS", "SHUTOPEN", "DATEOBS", "UTDATE", "OBS-DATE")),
+        *(
+            (key, NOON.isot)
+            for key in ("DATE_OBS", "SHUTOPEN", "DATEOBS", "UTDATE", "OBS-DATE", "DATE-BGN")
+        ),
         *((key, NOON.isot) for key in ("DATE_BEG", "EXPSTART", "UTC-OBS", "OBSTIME", "TIME-BEG")),
         *((key, NOON.isot) for key in ("DATE-UTC", "TIMESTAMP", "MIDTIME", "OBSTART", "UTSHUT")),
         ("ESO OBS START", NOON.isot),

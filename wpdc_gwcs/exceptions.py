@@ -23,6 +23,7 @@ __all__ = [
     "MatchError",
     "WPDCError",
     "WPDCWarning",
+    "without_frames",
 ]
 
 
@@ -63,7 +64,20 @@ class DetectionError(FrameFailure):
 
 
 class MatchError(FrameFailure):
-    """The sources could not be matched to the reference catalog with sufficient evidence."""
+    """The sources could not be matched to the reference catalog with sufficient evidence.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong.
+    found : dict, optional
+        Of a match that is further from the header than is allowed: ``shift`` (px), ``rotation``
+        (deg) and ``scale`` (factor) from the header to it.
+    """
+
+    def __init__(self, message="", *, found=None):
+        super().__init__(message)
+        self.found = found
 
 
 class FitError(FrameFailure):
@@ -107,3 +121,21 @@ class WPDCWarning(AstropyUserWarning):
 
 class CentroidWarning(WPDCWarning):
     """Centroids are of lower quality than asked for: windowed, for example, not PSF-fitted."""
+
+
+def without_frames(error):
+    """Let an error that is kept forget where it was raised.
+
+    Parameters
+    ----------
+    error : Exception
+        Its tracebacks, and those of what led to it, hold every array of the functions that it came
+        through: of an image, a hundred times what the frame needs.
+
+    Returns
+    -------
+    Exception
+        The same.
+    """
+    error.__traceback__ = error.__context__ = error.__cause__ = None
+    return error

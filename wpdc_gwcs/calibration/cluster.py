@@ -95,6 +95,15 @@ class _WatchedExecutor(Executor):
         self._ended = threading.Event()
         threading.Thread(target=self._watch, daemon=True).start()
 
+    @property
+    def n_workers(self):
+        """How many tasks are done at a time, at the moment."""
+        try:
+            workers = self._client.scheduler_info(n_workers=-1).get("workers", {})
+        except (OSError, RuntimeError, TimeoutError):
+            return 1
+        return max(1, sum(worker.get("nthreads", 1) for worker in workers.values()))
+
     def submit(self, fn, /, *args, **kwargs):
         future = Future()
         with self._lock:

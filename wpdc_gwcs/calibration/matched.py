@@ -1,6 +1,5 @@
 """One frame, matched to the reference catalog."""
 
-import logging
 import time
 from dataclasses import dataclass
 
@@ -42,8 +41,6 @@ __all__ = [
     "usable_sources",
     "with_errors",
 ]
-
-log = logging.getLogger(__name__)
 
 _ERROR_FLOOR = 0.01  # px
 
@@ -145,8 +142,8 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
             blind=settings.blind,
         )
     except MatchError as err:
-        raise MatchError(f"{err} ({left_out(rules_of(sources, frame, settings))})") from err
-    log.info("%s: %d of %d sources matched", frame.name, len(i_src), len(sources))
+        counts = left_out(rules_of(sources, frame, settings))
+        raise MatchError(f"{err} ({counts})", found=err.found) from err
     return MatchedFrame(
         name=frame.name,
         source=frame.source,

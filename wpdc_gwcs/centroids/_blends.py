@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial import KDTree
 
+from wpdc_gwcs.centroids._inverses import inverses
 from wpdc_gwcs.centroids._modes import blur_modes, reduced_normal
 
 __all__ = ["judge_profiles", "weigh_neighbors"]
@@ -162,7 +163,7 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
         for n in range(0, len(rows), _CHUNK)
     ]
     left, right, freedom = (np.concatenate(column) for column in zip(*parts, strict=True))
-    covariance = np.linalg.pinv(left)
+    covariance = inverses(left)
     amplitude = np.einsum("sij,sj->si", covariance, right)
     before = np.einsum("si,sij,sj->s", amplitude, left, amplitude)
     best = clean[np.argsort(covariance[clean].trace(axis1=1, axis2=2))]
@@ -170,7 +171,7 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     common, unsure = _common(stars, amplitude, covariance, best)
     amplitude -= common
     differences = _differences(amplitude[best], covariance[best])
-    weight = np.linalg.pinv(covariance + unsure + (1 + _MEDIAN_COST / _NEAREST) * differences)
+    weight = inverses(covariance + unsure + (1 + _MEDIAN_COST / _NEAREST) * differences)
     after = np.einsum("si,sij,sj->s", amplitude, weight, amplitude)
     excess[rows] = (before - after) / freedom
     angle = np.pi * np.arange(_N_DIRECTIONS) / _N_DIRECTIONS

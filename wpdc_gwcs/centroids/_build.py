@@ -291,11 +291,14 @@ def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
     base_x, taps_x, _ = spline_taps(center - over * (x - xc))
     base_y, taps_y, _ = spline_taps(center - over * (y - yc))
     taps = (taps_y[:, :, None] * taps_x[:, None, :]).reshape(-1, 16)
-    squares = (taps[:, :, None] * taps[:, None, :]).reshape(-1, 256)
+    # Of the symmetric products the lower half.
+    first, second = np.tril_indices(16)
+    squares = taps[:, first] * taps[:, second]
     width = 4 * size + 5
     band = np.zeros((width, size * size))
     right = np.zeros(size * size)
     cell = base_y * 1000 + base_x
+    # The four taps of a pixel end before those of the next begin, so no place is met twice.
     step = over * np.arange(-half, half + 1)
     tap = np.arange(-1, 3)
     for value in np.unique(cell):
@@ -303,12 +306,9 @@ def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
         iy = base_y[k[0]] + step[:, None] + tap
         ix = base_x[k[0]] + step[:, None] + tap
         index = (iy[:, None, :, None] * size + ix[None, :, None, :]).reshape(-1, 16)
-        np.add.at(right, index, (weight[k] * residual[k]).T @ taps[k])
-        normal = (weight[k].T @ squares[k]).reshape(-1, 16, 16)
-        offset = index[:, :, None] - index[:, None, :]
-        lower = offset >= 0
-        column = np.broadcast_to(index[:, None, :], offset.shape)
-        np.add.at(band, (offset[lower], column[lower]), normal[lower])
+        right[index] += (weight[k] * residual[k]).T @ taps[k]
+        column = index[:, second]
+        band[index[:, first] - column, column] += weight[k].T @ squares[k]
     _add_prior(band, profile.samples().mean(axis=0), fwhm, finest, over)
     try:
         solution = solveh_banded(band, right, lower=True, overwrite_ab=True, check_finite=False)

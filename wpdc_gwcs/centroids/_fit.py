@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import percentile_filter
 
 from wpdc_gwcs import kernels
-from wpdc_gwcs.centroids._profile import cutouts
+from wpdc_gwcs.cutouts import cut_squares, on_image
 
 __all__ = [
     "Field",
@@ -58,12 +58,15 @@ class Field:
         True where a pixel must not be used.
     photons : (ny, nx) ndarray or None
         As in `Sky`; None for pixels of one response.
+    full : (ny, nx) bool ndarray or None
+        More pixels that must not be used: those that are saturated.
     """
 
     image: np.ndarray
     rms: np.ndarray
     mask: np.ndarray | None
     photons: np.ndarray | None = None
+    full: np.ndarray | None = None
 
     def rows(self, start, stop, *, image):
         """Take some rows, with another image for theirs.
@@ -80,10 +83,11 @@ class Field:
         Field
             The rows.
         """
-        mask, photons = (
-            None if values is None else values[start:stop] for values in (self.mask, self.photons)
+        mask, photons, full = (
+            None if values is None else values[start:stop]
+            for values in (self.mask, self.photons, self.full)
         )
-        return Field(image, self.rms[start:stop], mask, photons)
+        return Field(image, self.rms[start:stop], mask, photons, full)
 
     def cut(self, stars, half, radius):
         """Cut out the surroundings of stars.
@@ -109,14 +113,19 @@ class Field:
             Noise of the background.
         """
         xc, yc = np.rint(stars.x).astype(int), np.rint(stars.y).astype(int)
-        pixels, use = cutouts(self.image, xc, yc, half)
         step = np.arange(-half, half + 1)
-        use &= (np.hypot(step[:, None], step) <= radius).ravel()
-        if self.mask is not None:
-            use &= ~cutouts(self.mask, xc, yc, half)[0]
-        variance = cutouts(self.rms, xc, yc, half)[0].astype(float) ** 2
-        photons = 1.0 if self.photons is None else cutouts(self.photons, xc, yc, half)[0]
-        return xc, yc, pixels.astype(float), use, Sky(variance, photons)
+
+        def cut(image):
+            return cut_squares(image, xc, yc, half).reshape(len(xc), len(step) ** 2)
+
+        use = on_image(self.image.shape, xc, yc, half) & (np.hypot(step[:, None], step) <= radius)
+        use = use.reshape(len(xc), len(step) ** 2)
+        for hidden in (self.mask, self.full):
+            if hidden is not None:
+                use &= ~cut(hidden)
+        variance = cut(self.rms).astype(float) ** 2
+        photons = 1.0 if self.photons is None else cut(self.photons)
+        return xc, yc, cut(self.image).astype(float), use, Sky(variance, photons)
 
 
 class Stars(NamedTuple):

@@ -416,10 +416,8 @@ def _field_of(data, error, saturation=None):
         if saturation is None:
             return Field(data.image, data.rms, data.mask, data.photons), data.unit
         # The wings of a saturated star still tell its flux, which matters to its neighbors.
-        mask = data.saturated(saturation)
-        if data.mask is not None:
-            mask |= data.mask
-        return Field(data.image, data.rms, mask, data.photons), data.unit
+        full = data.saturated(saturation)
+        return Field(data.image, data.rms, data.mask, data.photons, full), data.unit
     image = np.asarray(data)
     if image.ndim != 2:
         raise ValueError(f"the image must be 2-D, got {image.ndim} dimensions")

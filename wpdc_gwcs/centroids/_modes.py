@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from wpdc_gwcs.centroids._inverses import inverses
 from wpdc_gwcs.centroids._profile import Profile
 
 __all__ = ["blur_modes", "mode_profiles", "reduced_normal"]
@@ -107,6 +108,6 @@ def reduced_normal(field, profile, noise, stars, modes, radius, *, subtracted=Fa
     both = np.concatenate([own, common, residual[:, None]], axis=1)
     normal = (both[:, :-1] * weight[:, None]) @ both.transpose(0, 2, 1)
     # Positions and fluxes are eliminated star by star.
-    solved = np.linalg.pinv(normal[:, :3, :3]) @ normal[:, :3, 3:]
+    solved = inverses(normal[:, :3, :3]) @ normal[:, :3, 3:]
     reduced = normal[:, 3:, 3:] - normal[:, 3:, :3] @ solved
     return reduced[:, :, :-1], reduced[:, :, -1]

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from wpdc_gwcs.centroids._inverses import inverses
+
 __all__ = ["Noise", "NoiseBins", "bin_noise", "estimate_noise", "least_gain"]
 
 # Error of the profile below which nobody's data can tell.
@@ -101,7 +103,7 @@ def bin_noise(field, profile, noise, stars, *, radius, modes=(), own=None):
     good = use.sum(axis=1) >= 2 * n
     normal[~good] = np.eye(n)
     # A fit takes part of the scatter away, most where few pixels decide: the leverage.
-    inverse = np.linalg.pinv(normal)
+    inverse = inverses(normal)
     leverage = weight * np.einsum("sip,sij,sjp->sp", jacobian, inverse, jacobian)
     residual = pixels - model
     if own:
@@ -114,11 +116,24 @@ def bin_noise(field, profile, noise, stars, *, radius, modes=(), own=None):
     square = (model * model.max(axis=1, keepdims=True))[use]
     photons, variance = (model * sky.photons)[use], sky.variance[use]
     order = np.argsort(square)
-    bins = np.array_split(order, int(np.clip(len(order) // 50, 1, 40)))
+    values = np.stack([residual2, variance, photons, square])[:, order]
+    measured, *means = _medians(values, int(np.clip(len(order) // 50, 1, 40)))
     # 1.4826 MAD squared = median of the squares / 0.4549
-    measured = np.array([np.median(residual2[b]) for b in bins]) / 0.4549 + 1e-30
-    return NoiseBins(
-        measured, *(np.array([np.median(v[b]) for b in bins]) for v in (variance, photons, square))
+    return NoiseBins(measured / 0.4549 + 1e-30, *means)
+
+
+def _medians(values, n_bins):
+    """Medians (..., n_bins) of values (..., N) in bins of as many each, the first ones one more."""
+    size, more = divmod(values.shape[-1], n_bins)
+    split = more * (size + 1)
+    parts = values[..., :split], values[..., split:]
+    shapes = (more, size + 1), (n_bins - more, size)
+    return np.concatenate(
+        [
+            np.median(part.reshape(*values.shape[:-1], *shape), axis=-1)
+            for part, shape in zip(parts, shapes, strict=True)
+        ],
+        axis=-1,
     )
 
 

@@ -8,7 +8,7 @@ from scipy.ndimage import spline_filter, uniform_filter1d
 
 from wpdc_gwcs import kernels
 
-__all__ = ["Models", "Profile", "cutouts", "moffat_samples", "spline_coefficients", "spline_taps"]
+__all__ = ["Models", "Profile", "moffat_samples", "spline_coefficients", "spline_taps"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,34 +281,6 @@ def moffat_samples(shape, half, oversampling):
         :, oversampling * fine : -oversampling * fine : fine
     ]
     return samples / samples.sum() * oversampling**2
-
-
-def cutouts(image, xc, yc, half):
-    """Cut-outs (N, n) of 2 half + 1 px squares about integer centers, and where they are inside.
-
-    Parameters
-    ----------
-    image : (ny, nx) ndarray
-        Image.
-    xc, yc : (N,) int ndarray
-        Central pixels.
-    half : int
-        Half-width of the squares.
-
-    Returns
-    -------
-    pixels : (N, n) ndarray
-        Values; at the rim those of the outermost pixels are repeated.
-    inside : (N, n) bool ndarray
-        True where the pixel is on the image.
-    """
-    ny, nx = image.shape
-    step = np.arange(-half, half + 1)
-    iy, ix = yc[:, None] + step, xc[:, None] + step
-    inside = ((iy >= 0) & (iy < ny))[:, :, None] & ((ix >= 0) & (ix < nx))[:, None, :]
-    iy, ix = np.clip(iy, 0, ny - 1), np.clip(ix, 0, nx - 1)
-    flat = (len(xc), len(step) ** 2)
-    return image[iy[:, :, None], ix[:, None, :]].reshape(flat), inside.reshape(flat)
 
 
 def _hat(position, nodes):

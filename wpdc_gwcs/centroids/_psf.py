@@ -76,7 +76,7 @@ def learn_psf(field, stars, fwhm, gain, vary):
     n = len(stars.x)
     if n < MIN_STARS:
         return None
-    log.info("effective PSF from %d stars, own error %.3f", n, noise.mismatch)
+    log.debug("effective PSF from %d stars, own error %.3f", n, noise.mismatch)
     degree = int(np.searchsorted(_STARS_FOR_DEGREE, n))
     if vary == "never" or degree == 0:
         return profile
@@ -89,10 +89,10 @@ def learn_psf(field, stars, fwhm, gain, vary):
         np.median(fit_stars(field, p, noise, stars.take(left_out), radius=radius).chi2)
         for p in (profile, varying)
     ]
-    log.info("chi2 of left-out stars: constant PSF %.3f, varying %.3f", *chi2)
+    log.debug("chi2 of left-out stars: constant PSF %.3f, varying %.3f", *chi2)
     if not chi2[1] < 0.99 * chi2[0]:
         return profile
     varying = vary_profile(field, noise, stars, profile, fwhm, **trial)
     varying, stars, noise = learn_profile(field, noise, stars, varying, **options)
-    log.info("own error of the varying PSF %.3f", noise.mismatch)
+    log.debug("own error of the varying PSF %.3f", noise.mismatch)
     return varying if len(stars.x) >= MIN_STARS else profile

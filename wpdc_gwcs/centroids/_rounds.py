@@ -113,7 +113,7 @@ def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
     radius = fit_radius(fwhm)
     bins, _ = noise_bins(scene.field, profile, stars, quality, fwhm, gain, own=scene.own)
     noise = estimate_noise(bins, gain)
-    log.info("noise of the fits: %s", noise)
+    log.debug("noise of the fits: %s", noise)
     fits, rows = StarFits.unfitted(stars), np.arange(len(stars.x))
     if refit:
         scene.draw(_modelled(fits, stars, fwhm), radius)

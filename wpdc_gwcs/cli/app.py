@@ -17,6 +17,7 @@ from typing import Annotated
 
 import typer
 
+from wpdc_gwcs.cli.hints import hint_of
 from wpdc_gwcs.exceptions import FrameFailure, InputError, WPDCError, WPDCWarning
 
 __all__ = ["app", "main", "set_verbosity"]
@@ -94,7 +95,9 @@ def set_verbosity(verbose, quiet):
 
 
 def _fail(message, status):
-    print("wpdc: error: " + " ".join(str(message).split()), file=sys.stderr)
+    text = " ".join(str(message).split())
+    hint = hint_of(text)
+    print(f"wpdc: error: {text}" + (f"; try {hint}" if hint else ""), file=sys.stderr)
     return status
 
 

@@ -7,9 +7,12 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.hints import hint_of_frame
+from wpdc_gwcs.cli.inputs import expand_paths
 from wpdc_gwcs.cli.options import (
     Blind,
     Cache,
@@ -39,9 +42,12 @@ from wpdc_gwcs.cli.options import (
 )
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.cli.report import write_page
-from wpdc_gwcs.exceptions import FrameFailure, InputError, InternalError
+from wpdc_gwcs.exceptions import InputError, InternalError
 
 log = logging.getLogger("wpdc_gwcs.cli")
+
+# More frames than this are not told one by one.
+_MOST_LINES = 100
 
 Catalog = Annotated[
     str,
@@ -68,7 +74,8 @@ def calibrate_command(
         list[str],
         typer.Argument(
             metavar="FRAME",
-            help="FITS images (path or path[EXT]), FITS_LDAC lists, or source tables with --wcs.",
+            help="FITS images (path or path[EXT]), FITS_LDAC lists, or source tables with --wcs; "
+            "folders of them, patterns in quotes, @LIST for a file with one in each line.",
         ),
     ],
     catalog: Catalog,
@@ -290,7 +297,9 @@ def calibrate_command(
     keys = {"exposure_keyword": exposure_key, "camera": not no_camera}
     keys |= by_hand(epoch, pixel_scale, origin)
     keys |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
-    loaded = read_files(frames, wcs=wcs, detector=detector, **keys)
+    maps = [path for path in (catalog, mask, weight_map) if path is not None]
+    paths = expand_paths(frames, without=maps)
+    loaded = read_files(paths, wcs=wcs, detector=detector, **keys)
     page = output / "report.html"
     if report:
         require_free(page, overwrite or resume)
@@ -308,11 +317,11 @@ def calibrate_command(
             output=output,
             overwrite=overwrite,
             resume=resume,
+            keep=False,
             progress=progress,
         )
     if report:
-        tables = {c.frame: c.matches for c in run.calibrations}
-        write_page(run.summary, run.solutions, tables, page, overwrite=overwrite or resume)
+        write_page(output, page, overwrite=overwrite or resume)
     if not quiet:
         if resume:
             typer.echo(
@@ -323,18 +332,20 @@ def calibrate_command(
         if update:
             print_changes(run)
     state_first_pixel(loaded)
-    for calibration in run.calibrations:
-        if calibration.statistics["reasons"]:
-            log.warning(
-                "%s: degraded: %s", calibration.frame, "; ".join(calibration.statistics["reasons"])
-            )
-    for name, error in run.failures.items():
+    degraded = [row for row in run.summary if row["status"] == "degraded"]
+    for row in degraded[:_MOST_LINES]:
+        log.warning("%s: degraded: %s", row["frame"], row["reason"])
+    for name, error in list(run.failures.items())[:_MOST_LINES]:
         details = f" (details in {output / ERRORS})" if isinstance(error, InternalError) else ""
         log.error("%s: not solved: %s%s", name, error, details)
-    refused = [f.source for f in loaded if isinstance(run.failures.get(f.name), FrameFailure)]
-    if refused and not quiet:
-        given = f"{shlex.quote(refused[0])} --catalog {shlex.quote(catalog)}"
-        typer.echo(f"stage by stage, and what to try: wpdc explain {given} --output why.png")
+    for what, found in (("degraded", degraded), ("not solved", run.failures)):
+        if len(found) > _MOST_LINES:
+            log.warning(
+                "%d more frames are %s: see the column 'reason' of %s",
+                len(found) - _MOST_LINES, what, output / "summary.ecsv",
+            )  # fmt: skip
+    if not quiet:
+        tell_hints(run.failures, {f.name: f.source for f in loaded}, catalog=catalog, wcs=wcs)
     if any(isinstance(error, InputError) for error in run.failures.values()):
         raise typer.Exit(2)
     if run.failures:
@@ -379,6 +390,28 @@ def stored_solutions(paths):
     return single if len(paths) == 1 and single is not None else found
 
 
+def tell_hints(failures, sources, **given):
+    """Print what to try with the frames that failed, once for each kind of reason.
+
+    Parameters
+    ----------
+    failures : dict
+        Frame name to error.
+    sources : dict
+        Frame name to its path.
+    **given
+        As for `hint_of_frame`.
+    """
+    told = set()
+    for name, error in failures.items():
+        hint = hint_of_frame(error, sources[name], **given)
+        # Hints of one kind differ by the frame alone.
+        kind = None if hint is None else hint.replace(shlex.quote(sources[name]), "")
+        if kind is not None and kind not in told:
+            told.add(kind)
+            typer.echo(f"try: {hint}")
+
+
 def print_changes(run):
     """Print what an update has changed.
 
@@ -418,18 +451,22 @@ def print_summary(run, folder):
     folder : Path
         Where the results are.
     """
-    width = max([len("frame"), *(len(name) for name in run.summary["frame"])])
+    shown = run.summary
+    if len(shown) > _MOST_LINES:
+        typer.echo(f"{len(shown)} frames, see {folder / 'summary.ecsv'}; the last {_MOST_LINES}:")
+        shown = shown[-_MOST_LINES:]
+    width = max([len("frame"), *(len(name) for name in shown["frame"])])
     typer.echo(
         f"{'frame':<{width}}  status    sources  matched  sigma_dx  sigma_dy  rms_mas  seconds"
     )
-    for row in run.summary:
+    for row in shown:
         typer.echo(
             f"{row['frame']:<{width}}  {row['status']:<8}  {row['n_sources']:7d}  "
             f"{row['n_matched']:7d}  "
             f"{float(row['sigma_dx'].value):8.4f}  {float(row['sigma_dy'].value):8.4f}  "
             f"{float(row['rms_mas'].value):7.2f}  {float(row['seconds'].value):7.2f}"
         )
-    n = len(run.calibrations)
-    degraded = sum(row["status"] == "degraded" for row in run.summary)
+    n = int(np.sum(run.summary["status"] != "failed"))
+    degraded = int(np.sum(run.summary["status"] == "degraded"))
     also = f", {degraded} of them degraded" if degraded else ""
     typer.echo(f"{n} of {len(run.summary)} frames solved{also}; results in {os.fspath(folder)}")

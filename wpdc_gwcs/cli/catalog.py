@@ -10,6 +10,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.inputs import expand_paths
 from wpdc_gwcs.cli.options import Cache, Overwrite, Quiet, TapUrl, Verbose, require_free
 from wpdc_gwcs.exceptions import InputError
 
@@ -270,7 +271,7 @@ def _region_of(paths):
     from wpdc_gwcs.catalogs import Region
     from wpdc_gwcs.io import read_files
 
-    cones = [sky_of_frame(frame, Settings()) for frame in read_files(paths)]
+    cones = [sky_of_frame(frame, Settings()) for frame in read_files(expand_paths(paths))]
     cones = [cone for cone in cones if cone is not None]
     if not cones:
         raise InputError("--around: no frame has a WCS that tells where on the sky it is")

@@ -95,6 +95,14 @@ def simulate_command(
         str | None,
         typer.Option(metavar="MEAN,SCATTER", help="Colors of the stars (bp_rp); default none."),
     ] = None,
+    refraction: Annotated[
+        float,
+        typer.Option(metavar="MAS", help="Shift towards the zenith per magnitude of color."),
+    ] = 0.0,
+    lateral_color: Annotated[
+        float,
+        typer.Option(metavar="MAS", help="Shift outwards at the rim per magnitude of color."),
+    ] = 0.0,
     reference_limit: Annotated[
         float | None,
         typer.Option(metavar="MAG", help="Faintest star of the catalog; default all."),
@@ -198,6 +206,8 @@ def simulate_command(
             else None,
             galaxies=galaxies,
             colors=None if colors is None else read_numbers("--colors", colors, 2),
+            refraction=refraction * u.mas,
+            lateral_color=lateral_color * u.mas,
             epoch=None if epoch is None else _epochs(epoch, exposures),
             lost=lost,
             **given,

@@ -138,7 +138,7 @@ def detect_sources(
         found = extract_peaks(data, threshold, deblend_contrast, fwhm)
     table = _table_of([_measure(data, found, fwhm, gain, saturation)], fwhm)
     table.meta.update(fwhm=fwhm, saturation=saturation)
-    log.info(
+    log.debug(
         "%d sources, %d of them clean, FWHM %.2f px",
         len(table),
         np.count_nonzero(table["flags"] == 0),
@@ -209,7 +209,7 @@ def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_co
         new = _table_of(parts, fwhm)
         distance = KDTree(_places(sources)).query(_places(new))[0]
         new = new[(distance > _RESOLVED * fwhm) & (new["flags"] & FLAG_SATURATED == 0)]
-        log.info("%d more sources beside those subtracted", len(new))
+        log.debug("%d more sources beside those subtracted", len(new))
         result = vstack([result, new], metadata_conflicts="silent")
         result.meta.update(sources.meta)
     blended = _blended(*(np.asarray(result[c], float) for c in ("x", "y", "flux")), fwhm)

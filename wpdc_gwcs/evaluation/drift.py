@@ -16,7 +16,7 @@ from scipy.special import chdtrc
 
 from wpdc_gwcs.robust import robust_scatter
 
-__all__ = ["Drift", "detect_drift"]
+__all__ = ["Drift", "detect_drift", "mean_in_cells"]
 
 # Cells along each side of the detector in which a drift is looked for, and stars that a cell needs.
 _GRIDS = (2, 4, 8, 16)
@@ -163,6 +163,34 @@ def detect_drift(solution, matches, *, false_alarm=0.01):
     for name in ("x_min", "x_max", "y_min", "y_max", "dx", "dy", "sigma_dx", "sigma_dy"):
         cells[name].unit = "pix"
     return Drift(drifted, p_value, false_alarm, amplitude, area, stars.x.size, cells)
+
+
+def mean_in_cells(solution, matches, n_grid):
+    """Average residuals in the cells of a grid.
+
+    Parameters
+    ----------
+    solution : DistortionSolution
+        Of the detector.
+    matches : iterable of `~astropy.table.Table`
+        As for `detect_drift`.
+    n_grid : int
+        Cells along each side.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        A row for each cell with eight stars: ``x_min``, ``x_max``, ``y_min``, ``y_max``, ``n``,
+        ``dx``, ``dy``, ``sigma_dx``, ``sigma_dy``, in px.
+    """
+    stars = _Stars(solution, [_columns_of(table) for table in matches])
+    cells = stars.average(n_grid)
+    table = Table(_rows(solution, n_grid, cells, np.zeros(len(cells.index), bool)))
+    table.remove_columns(["p_value", "changed"])
+    for name in table.colnames:
+        if name != "n":
+            table[name].unit = "pix"
+    return table
 
 
 def _columns_of(table):

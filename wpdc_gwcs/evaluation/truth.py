@@ -120,6 +120,8 @@ def score_frame(calibration, truth, stars, *, cuts=None, limit=0.01, n_grid=101)
             f"{tuple(solution.image_shape)}"
         )
     cuts = Cuts() if cuts is None else cuts
+    if truth.color is not None:
+        calibration = calibration.at_color(truth.color)
     x, y, dx, dy = truth.wcs_error(calibration.wcs, n_grid=n_grid)
     inside = cuts.place(x, y, solution.crpix)
     error = np.where(inside, [dx, dy], np.nan)

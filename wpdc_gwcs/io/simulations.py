@@ -17,6 +17,7 @@ from astropy.table import Table
 
 from wpdc_gwcs.exceptions import InputError
 from wpdc_gwcs.io.files import OutputExistsError, atomic_path
+from wpdc_gwcs.io.ldac import write_ldac
 from wpdc_gwcs.io.tables import read_table, write_table
 from wpdc_gwcs.io.truth import read_truths, write_truths
 
@@ -175,7 +176,7 @@ def write_simulation(
                 exposure.header.totextfile(temporary)
         else:
             with atomic_path(frames[k], overwrite=overwrite) as temporary:
-                _write_ldac(listed, exposure.header, temporary)
+                _write_sources(listed, exposure.header, temporary)
         stars.rename_column("reference_index", "catalog_index")
         for name in stars.colnames:
             stars[name].unit = _UNITS.get(name)
@@ -193,16 +194,7 @@ def write_simulation(
     return {"reference": catalog, "frames": frames, "headers": headers, "truth": truth}
 
 
-def _write_ldac(s, header, path):
-    cards = [str(card).ljust(80).encode("ascii") for card in header.cards]
-    cards.append(b"END".ljust(80))
-    # Padded with blanks: readers in C take a NUL for the end of the header.
-    text = np.frombuffer(b"".join(cards), np.uint8).reshape(1, len(cards), 80)
-    imhead = fits.BinTableHDU.from_columns(
-        [fits.Column("Field Header Card", f"{text.size}B", dim=f"(80, {len(cards)})", array=text)],
-        name="LDAC_IMHEAD",
-    )
-    imhead.header["TFORM1"] = f"{text.size}A"
+def _write_sources(s, header, path):
     columns = {
         "XWIN_IMAGE": s["x"] + 1,  # FITS_LDAC counts pixels from 1
         "YWIN_IMAGE": s["y"] + 1,
@@ -213,5 +205,4 @@ def _write_ldac(s, header, path):
         "FLUXERR_AUTO": s["flux"] / s["snr"],
         "FLAGS": np.zeros(len(s), np.int16),
     }
-    objects = fits.BinTableHDU(Table(columns), name="LDAC_OBJECTS")
-    fits.HDUList([fits.PrimaryHDU(), imhead, objects]).writeto(path)
+    write_ldac(Table(columns), header, path)

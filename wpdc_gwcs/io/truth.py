@@ -17,7 +17,8 @@ Layout of ``truth``, format version 1.0.0, all plain YAML:
                    `~wpdc_gwcs.simulation.Distortion`: ``axis``, ``radial``, ``terms`` (m, n and the
                    coefficient), ``waves`` (wave vector, phase, amplitude); complex numbers as pairs
 ``frames``         name to ``detector``, ``exposure`` (or null), ``epoch``, ``file``, ``measured``
-                   ("list" or "image") and the linear WCS ``crpix`` (1-based), ``crval``, ``cd``
+                   ("list" or "image"), ``color`` (of the stars that the map is of, or null) and the
+                   linear WCS ``crpix`` (1-based), ``crval``, ``cd``
 ================== =============================================================================
 """
 
@@ -140,6 +141,7 @@ def write_truths(truths, path, *, camera, catalog, files, overwrite=False):
                 "epoch": t.epoch,
                 "file": file,
                 "measured": measured,
+                "color": t.color,
                 "crpix": t.linear_wcs.wcs.crpix.tolist(),
                 "crval": t.linear_wcs.wcs.crval.tolist(),
                 "cd": t.linear_wcs.wcs.cd.tolist(),
@@ -192,6 +194,7 @@ def read_truths(path):
                     node["cd"],
                     distortions[node["detector"]].image_shape,
                 ),
+                color=node["color"],
             )
             for name, node in tree["frames"].items()
         }

@@ -147,7 +147,7 @@ def _choose(coarse, *, allow_none):
         (replace(c, score=float(s)) for c, s in zip(candidates, scores)), key=lambda c: c.score
     )
     best = next(c for c in ranked if allow_none or c.kernel != "none")
-    log.info("look-up table: %s", best)
+    log.debug("look-up table: %s", best)
     return best, tuple(ranked)
 
 

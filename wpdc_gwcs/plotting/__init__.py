@@ -26,11 +26,14 @@ of a detector or a camera      shows
 `plot_magnitude`               residuals against magnitude, pooled
 `plot_centroids`               centroid errors against magnitude, and the photon limit
 `plot_sky_offsets`             offsets on the sky with histograms and Gaussian fits
+`plot_drift_history`           residuals and drift of a detector over time
+`plot_cell_history`            the same, cell by cell
 =============================  =====================================================================
 """
 
 from wpdc_gwcs.plotting.before_after import plot_before_after
 from wpdc_gwcs.plotting.focal_plane import plot_focal_plane
+from wpdc_gwcs.plotting.history import plot_cell_history, plot_drift_history
 from wpdc_gwcs.plotting.magnitudes import (
     plot_centroids,
     plot_magnitude,
@@ -49,8 +52,10 @@ from wpdc_gwcs.plotting.weights import plot_weights
 
 __all__ = [
     "plot_before_after",
+    "plot_cell_history",
     "plot_cdf",
     "plot_centroids",
+    "plot_drift_history",
     "plot_focal_plane",
     "plot_lookup_table",
     "plot_magnitude",

@@ -12,7 +12,7 @@ from wpdc_gwcs.reproduction.claims import CLAIMS, Claim
 from wpdc_gwcs.reproduction.cluster import reproduce_cluster
 from wpdc_gwcs.reproduction.detectors import reproduce_detectors
 from wpdc_gwcs.reproduction.results import tabulate_results
-from wpdc_gwcs.reproduction.scale import FULL, QUICK, Scale
+from wpdc_gwcs.reproduction.scale import FULL, QUICK, SEED, Scale
 from wpdc_gwcs.reproduction.weights import reproduce_weights
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "FULL",
     "PARTS",
     "QUICK",
+    "SEED",
     "Claim",
     "Scale",
     "reproduce",
@@ -41,7 +42,7 @@ PARTS = {
 }
 
 
-def reproduce(parts, folder, *, scale=FULL, seed=1, jobs=1, overwrite=False, progress=None):
+def reproduce(parts, folder, *, scale=FULL, seed=SEED, jobs=1, overwrite=False, progress=None):
     """Reproduce parts of the paper.
 
     Parameters
@@ -53,7 +54,7 @@ def reproduce(parts, folder, *, scale=FULL, seed=1, jobs=1, overwrite=False, pro
     scale : Scale, optional
         How large it is: `FULL`, as the paper, or `QUICK`.
     seed : int, optional
-        Another seed, another camera.
+        Another seed, another camera; the numbers of the documentation are of `SEED`.
     jobs : int, optional
         Processes in which frames are matched.
     overwrite : bool, optional

@@ -2,35 +2,51 @@
 
 ::
 
-    simulate --10 exposures of 4 chips--> calibrate --> pool_residuals, plot_sky_offsets
-        literal: a weighted cubic of each exposure, no table
-        ours: the default, and its cubic alone
+    simulate --10 exposures of 4 chips----> calibrate --> pool_residuals, plot_sky_offsets
+    real headers --the same of one chip-->      literal: a weighted cubic of each exposure, no table
+                                                ours: the default, and its cubic alone
+                                            scamp: where it is installed
 """
 
+import warnings
+
+import numpy as np
 from astropy.coordinates import SkyCoord
 
 from wpdc_gwcs.calibration import Settings, calibrate
-from wpdc_gwcs.evaluation import pool_residuals
+from wpdc_gwcs.evaluation import evaluate, pool_residuals
+from wpdc_gwcs.exceptions import WPDCError, WPDCWarning
 from wpdc_gwcs.plotting import plot_sky_offsets
+from wpdc_gwcs.reproduction.headers import find_headers, header_camera
 from wpdc_gwcs.reproduction.results import tabulate_results
-from wpdc_gwcs.reproduction.scoring import score_run, sky_error
+from wpdc_gwcs.reproduction.scale import SEED
+from wpdc_gwcs.reproduction.scamp import has_scamp, solve_with_scamp
+from wpdc_gwcs.reproduction.scoring import sky_error
 from wpdc_gwcs.simulation import simulate
 
 __all__ = ["reproduce_bass"]
 
 # Where the paper's exposures point.
 _CENTER = SkyCoord(278.8, 40.0, unit="deg")
+# Stars per square arcmin that leave about as many on a chip as the paper has: 49,158 on 40 images.
+_DENSITY = 1.5
 # What the paper has is a cubic alone, about the matched source nearest to the center.
 _RUNS = {
     "literal": {"method": "paper", "lut": "none"},
     "cubic": {"lut": "none"},
     "ours": {},
 }
+# Within this radius of a real chip all stars weigh the same, px (section 4.2).
+_R0 = 2000.0
 _MOMENTS = ("mean_alpha", "sigma_alpha", "mean_delta", "sigma_delta")
+_SCAMP = "scamp"
+# BASS was solved by SCAMP with polynomials of this degree (section 1 of the paper).
+_SCAMP_DEGREE = 4
+_MAS = 3.6e6  # per deg
 
 
-def reproduce_bass(folder, scale, *, seed=1, jobs=1, progress=None):
-    """Reproduce the paper's results for BASS, with distortions of its kind.
+def reproduce_bass(folder, scale, *, seed=SEED, jobs=1, progress=None):
+    """Reproduce the paper's results for BASS.
 
     Parameters
     ----------
@@ -49,38 +65,105 @@ def reproduce_bass(folder, scale, *, seed=1, jobs=1, progress=None):
     -------
     `~astropy.table.QTable`
         See `~wpdc_gwcs.reproduction.results.tabulate_results`.  Items are "all", the default
-        against the literal cubic, and "cubic", where both have no table; ``wcs_alpha`` and
-        ``wcs_delta`` are the error of the WCS itself, without the noise of centroids.
+        against the literal cubic, and "cubic", where both have no table, of four chips with
+        distortions of their own; "scamp", where ``ours`` is what SCAMP gives here, if it is
+        installed; and "HEADER" and "HEADER cubic" for each real header of 90Prime, if there are
+        any.  ``wcs_alpha`` and ``wcs_delta`` are the error of the WCS itself, without the noise of
+        centroids.
 
     Notes
     -----
-    Writes ``sky-offsets-literal.png``, ``sky-offsets-cubic.png`` and ``sky-offsets-ours.png``.
+    Headers are looked for under the folder that the environment variable ``WPDC_GWCS_DATA`` names.
+    Writes ``sky-offsets-literal.png``, ``sky-offsets-cubic.png``, ``sky-offsets-ours.png`` and,
+    where it is installed, ``sky-offsets-scamp.png``.
     """
-    options = {"density": 3.0, **scale.bass}
-    simulation = simulate(scale.n_bass, camera="bass-90prime", center=_CENTER, seed=seed, **options)
-    numbers = {}
-    for done, (name, choices) in enumerate(_RUNS.items()):
-        run = calibrate(
-            [exposure.frame() for exposure in simulation.exposures],
+    headers = find_headers()[: scale.n_headers]
+    steps = 1 + len(headers)
+    options = {"center": _CENTER, "seed": seed, "density": _DENSITY, **scale.bass}
+    simulation = simulate(scale.n_bass, camera="bass-90prime", **options)
+    runs = _calibrate(simulation, scale.r0_bass, jobs)
+    numbers = {name: _quantities(simulation, run) for name, run in runs.items()}
+    tables = {name: [c.matches for c in run.calibrations] for name, run in runs.items()}
+    found = _side_by_side(numbers, "all", "cubic")
+    if scale.scamp and has_scamp():
+        try:
+            solved = solve_with_scamp(simulation, degree=_SCAMP_DEGREE, threads=jobs)
+        except WPDCError as problem:
+            warnings.warn(f"SCAMP is left out: {problem}", WPDCWarning, stacklevel=2)
+        else:
+            tables[_SCAMP], values = _hold_against(solved, simulation, runs["ours"])
+            found |= {(_SCAMP, *key): (np.nan, value) for key, value in values.items()}
+    limit = 5 * max(numbers["literal"][f"sigma_{axis}", "mas"] for axis in ("alpha", "delta"))
+    for name, matches in tables.items():
+        axes = plot_sky_offsets(matches, title=name, limit=None if name == _SCAMP else limit)
+        axes[0].figure.savefig(folder / f"sky-offsets-{name}.png", dpi=110)
+    if progress is not None:
+        progress("bass", 1, steps)
+    for done, path in enumerate(headers):
+        camera, degree = header_camera(path)
+        simulation = simulate(
+            scale.n_bass, camera=camera, center=_CENTER, seed=seed, density=_DENSITY
+        )
+        runs = _calibrate(simulation, _R0, jobs)
+        numbers = {name: _quantities(simulation, run) for name, run in runs.items()}
+        found |= _side_by_side(numbers, path.stem, f"{path.stem} cubic")
+        found[path.stem, "degree", ""] = (degree, degree)
+        if progress is not None:
+            progress("bass", done + 2, steps)
+    return tabulate_results("bass", found)
+
+
+def _calibrate(simulation, r0, jobs):
+    frames = [exposure.frame() for exposure in simulation.exposures]
+    return {
+        name: calibrate(
+            frames,
             simulation.reference,
-            settings=Settings(r0=scale.r0_bass, reference_point="nearest-source", **choices),
+            settings=Settings(r0=r0, reference_point="nearest-source", **choices),
             jobs=jobs,
         )
-        pooled = pool_residuals(run.calibrations)[-1]
-        wcs = sky_error(run, score_run(simulation, run))
-        numbers[name] = {
-            **{(moment, "mas"): getattr(pooled, moment) for moment in _MOMENTS},
-            ("wcs_alpha", "mas"): wcs[0],
-            ("wcs_delta", "mas"): wcs[1],
-            ("n_stars", ""): pooled.statistics.n,
-        }
-        axes = plot_sky_offsets([c.matches for c in run.calibrations], title=name)
-        axes[0].figure.savefig(folder / f"sky-offsets-{name}.png", dpi=110)
-        if progress is not None:
-            progress("bass", done + 1, len(_RUNS))
-    found = {
+        for name, choices in _RUNS.items()
+    }
+
+
+def _quantities(simulation, run):
+    pooled = pool_residuals(run.calibrations)[-1]
+    truths = {exposure.name: exposure for exposure in simulation.exposures}
+    alpha, delta = sky_error([(truths[c.frame], c.wcs) for c in run.calibrations])
+    return {
+        **{(moment, "mas"): getattr(pooled, moment) for moment in _MOMENTS},
+        ("wcs_alpha", "mas"): alpha,
+        ("wcs_delta", "mas"): delta,
+        ("n_stars", ""): pooled.statistics.n,
+    }
+
+
+def _side_by_side(numbers, full, cubic):
+    return {
         (item, *key): (numbers["literal"][key], numbers[name][key])
-        for item, name in (("all", "ours"), ("cubic", "cubic"))
+        for item, name in ((full, "ours"), (cubic, "cubic"))
         for key in numbers["literal"]
     }
-    return tabulate_results("bass", found)
+
+
+def _hold_against(solved, simulation, run):
+    """Residuals of our pairs with the WCSs of SCAMP, and what they come to."""
+    found, offsets = [], []
+    for c in run.calibrations:
+        table = c.matches.copy()
+        ra, dec = solved[c.frame].wcs_pix2world(table["x"], table["y"], 0)
+        table["source_ra"], table["source_dec"] = ra, dec
+        m = table[np.asarray(table["used"], bool)]
+        d_ra = (m["source_ra"] - m["ra"] + 180) % 360 - 180
+        offsets.append([d_ra * np.cos(np.deg2rad(m["dec"])), m["source_dec"] - m["dec"]])
+        found.append(table)
+    alpha, delta = np.concatenate(offsets, axis=1) * _MAS
+    s = evaluate(alpha, delta)
+    wcs = sky_error([(exposure, solved[exposure.name]) for exposure in simulation.exposures])
+    values = (s.mean_dx, s.sigma_dx, s.mean_dy, s.sigma_dy)
+    return found, {
+        **{(name, "mas"): value for name, value in zip(_MOMENTS, values, strict=True)},
+        ("wcs_alpha", "mas"): wcs[0],
+        ("wcs_delta", "mas"): wcs[1],
+        ("n_stars", ""): s.n,
+    }

@@ -13,6 +13,7 @@ from wpdc_gwcs.calibration import measure_sources
 from wpdc_gwcs.evaluation import evaluate
 from wpdc_gwcs.plotting import plot_centroids
 from wpdc_gwcs.reproduction.results import tabulate_results
+from wpdc_gwcs.reproduction.scale import SEED
 from wpdc_gwcs.simulation import simulate
 
 __all__ = ["measure_against_truth", "photon_limit", "reproduce_centroids"]
@@ -57,7 +58,7 @@ def measure_against_truth(exposure):
     return found
 
 
-def reproduce_centroids(folder, scale, *, seed=1, jobs=1, progress=None):
+def reproduce_centroids(folder, scale, *, seed=SEED, jobs=1, progress=None):
     """Reproduce the paper's centroid residuals against magnitude.
 
     Parameters

@@ -59,6 +59,7 @@ DETECTORS = tuple(_TABLE_2)
 _OTHERS = (
     ("detectors", "all", "largest_distortion", "pix", 200.0, "figure 1, section 2"),
     ("detectors", "g-1", "share_below_0p01", "", 0.90, "section 3.3"),
+    ("detectors", "g-1", "share_of_cells_below_0p01", "", 0.90, "section 3.3, figure 6"),
     ("detectors", "g-1", "table_dx_first", "pix", 5.157, "table 1"),
     ("detectors", "g-1", "table_dy_first", "pix", 2.848, "table 1"),
     ("detectors", "g-1", "table_dx_last", "pix", 0.884, "table 1"),

@@ -17,6 +17,7 @@ from wpdc_gwcs.evaluation import Cuts, evaluate, pool_residuals, pool_scores
 from wpdc_gwcs.plotting import plot_magnitude, plot_residual_maps
 from wpdc_gwcs.reproduction.detectors import METHODS
 from wpdc_gwcs.reproduction.results import tabulate_results
+from wpdc_gwcs.reproduction.scale import SEED
 from wpdc_gwcs.reproduction.scoring import score_run
 from wpdc_gwcs.simulation import KingCluster, simulate
 
@@ -31,7 +32,7 @@ _MIN_SNR = 30.0
 _MAGNITUDES, _WIDTH = (19.0, 23.75), 0.5
 
 
-def reproduce_cluster(folder, scale, *, seed=1, jobs=1, progress=None):
+def reproduce_cluster(folder, scale, *, seed=SEED, jobs=1, progress=None):
     """Reproduce the paper's results for a globular cluster.
 
     Parameters

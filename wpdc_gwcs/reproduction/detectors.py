@@ -21,6 +21,7 @@ from wpdc_gwcs.evaluation import (
 from wpdc_gwcs.io import atomic_path, write_table
 from wpdc_gwcs.plotting import plot_before_after, plot_focal_plane
 from wpdc_gwcs.reproduction.results import tabulate_results
+from wpdc_gwcs.reproduction.scale import SEED
 from wpdc_gwcs.reproduction.scoring import CLOSE_PX, score_run
 from wpdc_gwcs.simulation import simulate
 
@@ -96,12 +97,14 @@ def _quantities(pooled, score):
         ("wcs_rms", "pix"): score.wcs_rms,
         ("wcs_max", "pix"): score.wcs_max,
         ("share_below_0p01", ""): score.share_below,
+        # The paper knows no truth: it counts the cells of its map whose mean residual is short.
+        ("share_of_cells_below_0p01", ""): pooled.share_below,
         ("n_stars", ""): s.n,
         ("n_wrong", ""): score.n_wrong_used,
     }
 
 
-def reproduce_detectors(folder, scale, *, seed=1, jobs=1, progress=None):
+def reproduce_detectors(folder, scale, *, seed=SEED, jobs=1, progress=None):
     """Reproduce the paper's results for the detectors of the Main Survey Camera.
 
     Parameters

@@ -39,23 +39,18 @@ def score_run(simulation, run, *, images=False):
     return scores
 
 
-def sky_error(run, scores):
-    """Give the error of the WCS along east and north, over all frames.
+def sky_error(solved):
+    """Give the error of WCSs along east and north, over all frames and their detectors.
 
     Parameters
     ----------
-    run : CalibrationRun
-        The calibration.
-    scores : list of TruthScore
-        Of its frames, in order.
+    solved : sequence of (FrameTruth, callable)
+        The truth about each frame, and its WCS, as of `FrameTruth.wcs_error`.
 
     Returns
     -------
     alpha, delta : float
         Root mean squares, mas.
     """
-    errors = [
-        c.cd @ [s.error_x.ravel(), s.error_y.ravel()] * _MAS
-        for c, s in zip(run.calibrations, scores, strict=True)
-    ]
+    errors = [truth.linear_wcs.wcs.cd @ truth.wcs_error(wcs)[2:] * _MAS for truth, wcs in solved]
     return tuple(float(v) for v in np.sqrt(np.mean(np.concatenate(errors, axis=1) ** 2, axis=1)))

@@ -14,6 +14,7 @@ from wpdc_gwcs.io import write_table
 from wpdc_gwcs.plotting import plot_slices, plot_weights
 from wpdc_gwcs.reproduction.detectors import calibrate_fields, simulate_fields
 from wpdc_gwcs.reproduction.results import tabulate_results
+from wpdc_gwcs.reproduction.scale import SEED
 
 __all__ = ["reproduce_weights"]
 
@@ -30,7 +31,7 @@ _WEIGHTS = {
 _SHORT_PX = 0.1
 
 
-def reproduce_weights(folder, scale, *, seed=1, jobs=1, progress=None):
+def reproduce_weights(folder, scale, *, seed=SEED, jobs=1, progress=None):
     """Reproduce the paper's comparison of radial weights.
 
     Parameters

@@ -12,6 +12,8 @@ __all__ = ["Distortion"]
 _BLOCK = 4096
 # Newton's steps end below this, in half-widths of the detector.
 _LAST_STEP = 1e-9
+# A map is a polynomial if it is one to this, px.
+_SAME_PX = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +118,44 @@ class Distortion:
             for m in range(order + 1)
         }
         return cls(image_shape, axis, (1.0, quintic), terms)
+
+    @classmethod
+    def from_map(cls, image_shape, undistort, *, degree):
+        """Give the distortion that a polynomial map of pixels is.
+
+        Parameters
+        ----------
+        image_shape : (int, int)
+            Shape of the detector ``(ny, nx)``.
+        undistort : callable
+            Detector pixels to undistorted ones, ``undistort(x, y) -> (x, y)``; zero based.
+        degree : int
+            Total degree of the polynomial.
+
+        Returns
+        -------
+        Distortion
+            The same map, to 1e-6 px, with its constant and its linear part.
+
+        Raises
+        ------
+        ValueError
+            If the map is no polynomial of this degree.
+        """
+        empty = cls(tuple(image_shape), 0j, (0.0, 0.0), {})
+        # A polynomial is known by its values at more points than it has coefficients.
+        node = np.cos(np.pi * np.arange(degree + 3) / (degree + 2))
+        z = (node + 1j * node[:, None]).ravel()
+        moved = empty._normalise(*undistort(*empty._pixels(z))) - z
+        powers = [(m, order - m) for order in range(degree + 1) for m in range(order + 1)]
+        design = np.stack([z**m * np.conj(z) ** n for m, n in powers], axis=1)
+        terms = np.linalg.lstsq(design, moved, rcond=None)[0]
+        worst = np.abs(design @ terms - moved).max() * max(image_shape) / 2
+        if not worst < _SAME_PX:
+            raise ValueError(
+                f"undistort must be a polynomial of degree {degree}, is {worst:.3g} px off one"
+            )
+        return replace(empty, terms=dict(zip(powers, terms.tolist(), strict=True)))
 
     def scaled(self, factor):
         """Give the same distortion with another size.

@@ -14,6 +14,7 @@ from astropy.wcs import WCS
 from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.simulation.camera import SimulatedCamera, SimulatedDetector
+from wpdc_gwcs.simulation.chromatism import Chromatism
 from wpdc_gwcs.simulation.light import DISC, PSF, add_gaussians
 from wpdc_gwcs.simulation.measurement import Measurement
 from wpdc_gwcs.simulation.stars import CATALOG_EPOCH
@@ -56,9 +57,23 @@ class SimulatedExposure(FrameTruth):
     _field: object = field(repr=False)
     _measurement: Measurement = field(repr=False)
     _streams: tuple = field(repr=False)
+    _chromatism: Chromatism | None = field(repr=False)
 
     @classmethod
-    def of(cls, camera, detector, *, label, epoch, pointing, field, measurement, streams, place):
+    def of(
+        cls,
+        camera,
+        detector,
+        *,
+        label,
+        epoch,
+        pointing,
+        field,
+        measurement,
+        streams,
+        place,
+        chromatism=None,
+    ):
         """Make the exposure of a detector.
 
         Parameters
@@ -81,6 +96,8 @@ class SimulatedExposure(FrameTruth):
             Sources of the numbers of the source list and of the image.
         place : int
             Number of the detector in the camera.
+        chromatism : Chromatism, optional
+            How color moves its stars.
 
         Returns
         -------
@@ -111,6 +128,8 @@ class SimulatedExposure(FrameTruth):
             _field=field,
             _measurement=measurement,
             _streams=(bits, seed, place),
+            _chromatism=chromatism,
+            color=None if chromatism is None else chromatism.color,
         )
 
     @property
@@ -169,7 +188,10 @@ class SimulatedExposure(FrameTruth):
         p, e, n = directions(stars["ra"].data, stars["dec"].data)
         years = self.epoch - CATALOG_EPOCH
         ra, dec = angles(p + years * _MAS * (e * stars["pmra"].data + n * stars["pmdec"].data))
-        x, y = self.pixel(ra, dec)
+        seen = ra, dec
+        if self._chromatism is not None:
+            seen = self._chromatism.move(ra, dec, stars["color"].data)
+        x, y = self.pixel(*seen)
         with np.errstate(invalid="ignore"):
             near = (x > -_MARGIN) & (x < nx - 1 + _MARGIN) & (y > -_MARGIN) & (y < ny - 1 + _MARGIN)
         columns = {"x": x[near], "y": y[near], "ra": ra[near], "dec": dec[near]}

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from wpdc_gwcs.frozen import freeze_attributes
 from wpdc_gwcs.simulation.camera import SimulatedCamera, require, value_of
+from wpdc_gwcs.simulation.chromatism import Chromatism
 from wpdc_gwcs.simulation.exposure import SimulatedExposure
 from wpdc_gwcs.simulation.measurement import Measurement
 from wpdc_gwcs.simulation.pointing import Pointing, aim
@@ -90,6 +91,8 @@ def simulate(
     cluster=None,
     galaxies=0.0,
     colors=None,
+    refraction=0.0 * u.mas,
+    lateral_color=0.0 * u.mas,
     proper_motion=None,
     epoch=None,
     dither=None,
@@ -136,6 +139,12 @@ def simulate(
         Galaxies per square arcmin, which are in no catalog.
     colors : (float, float), optional
         Mean and scatter of the stars' colors; without them the catalog has none.
+    refraction : `~astropy.units.Quantity`, optional
+        Shift of stars towards the zenith per magnitude of color, which is somewhere else for each
+        exposure.
+    lateral_color : `~astropy.units.Quantity`, optional
+        Shift of stars away from where the camera points per magnitude of color, at the farthest
+        corner of its detectors.  The true WCS is that of the mean color.
     proper_motion : `~astropy.units.Quantity`, optional
         Scatter of the proper motions per axis.
     epoch : float or (n_exposures,) array_like, optional
@@ -231,6 +240,7 @@ def simulate(
         "proper_motion": float(value_of("proper_motion", usual["proper_motion"], u.mas / u.yr)),
         "colors": colors,
     }
+    chromatic = _chromatic(camera, colors, refraction, lateral_color)
     measurement = Measurement(
         spurious=usual["spurious"],
         lost=lost,
@@ -272,6 +282,11 @@ def simulate(
         vectors, *_ = directions(stars["ra"].data, stars["dec"].data)
         field = StarField(stars, vectors)
         for k, (nominal, true, generator, image_seed) in enumerate(pointings):
+            chromatism = chromatic and Chromatism.of(
+                **chromatic,
+                center=(true.ra, true.dec),
+                rng=np.random.default_rng(streams[2 + k].spawn(1)[0]),
+            )
             label = f"{k + 1:02d}" if len(centers) == 1 else f"f{number + 1:02d}-{k + 1:02d}"
             exposures += [
                 SimulatedExposure.of(
@@ -284,6 +299,7 @@ def simulate(
                     measurement=measurement,
                     streams=(generator.jumped(j), image_seed),
                     place=j,
+                    chromatism=chromatism,
                 )
                 for j, d in enumerate(camera.detectors)
             ]
@@ -345,6 +361,24 @@ def _each(name, values, n, what):
             f"{name} must be one number, or one for each {what} ({n}), not {values.tolist()}"
         )
     return np.broadcast_to(values, (n,))
+
+
+def _chromatic(camera, colors, refraction, lateral_color):
+    """Sizes of the shifts by color in rad per magnitude, `None` where there are none."""
+    sizes = {
+        name: float(value_of(name, value, u.rad))
+        for name, value in (("refraction", refraction), ("lateral_color", lateral_color))
+    }
+    if not any(sizes.values()):
+        return None
+    require("colors", colors, colors is not None, "given where places depend on color")
+    rim = max(np.hypot(*d.center) + np.hypot(*d.image_shape) / 2 for d in camera.detectors)
+    return {
+        "color": colors[0],
+        "refraction": sizes["refraction"],
+        "lateral": sizes["lateral_color"],
+        "rim": np.deg2rad(rim * camera.arcsec / 3600),
+    }
 
 
 def _middle(camera):

@@ -1,6 +1,6 @@
 """The truth about a frame: an exact map from its pixels to the sky and back."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from astropy.wcs import WCS
@@ -28,6 +28,8 @@ class FrameTruth:
         The distortion of the detector.
     linear_wcs : `astropy.wcs.WCS`
         The true WCS of undistorted pixels.
+    color : float, optional
+        Color of the stars that the map is of, where places depend on color; others are moved.
     """
 
     name: str
@@ -36,6 +38,7 @@ class FrameTruth:
     exposure: str | None
     distortion: Distortion
     linear_wcs: WCS
+    color: float | None = field(default=None, kw_only=True)
 
     @property
     def image_shape(self):
