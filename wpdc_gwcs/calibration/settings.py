@@ -73,7 +73,7 @@ class Settings:
     seed : int, optional
         Seed of the random choice of held-out stars.
     method : {'wpdc', 'paper'}, optional
-        One solution of all exposures with learnt priors (``wpdc``), or the literal WPDC-2P
+        One solution of all exposures with learned priors (``wpdc``), or the literal WPDC-2P
         (``paper``), to be compared with: a polynomial of each exposure about its header's tangent
         point, raw residuals in a bilinear table.
     """

@@ -97,7 +97,7 @@ def simulate_command(
     ] = None,
     refraction: Annotated[
         float,
-        typer.Option(metavar="MAS", help="Shift towards the zenith per magnitude of color."),
+        typer.Option(metavar="MAS", help="Shift toward the zenith per magnitude of color."),
     ] = 0.0,
     lateral_color: Annotated[
         float,

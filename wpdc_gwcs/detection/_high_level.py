@@ -297,7 +297,7 @@ def _unlike_stars(minor, size, snr, flags):
 
 
 def _blended(x, y, flux, fwhm):
-    """Mark sources whose core holds more than a few per cent of a neighbor's light."""
+    """Mark sources whose core holds more than a few percent of a neighbor's light."""
     blended = np.zeros(len(x), bool)
     pairs = KDTree(np.column_stack([x, y])).query_pairs(4 * fwhm, output_type="ndarray")
     if len(pairs) == 0:

@@ -74,7 +74,7 @@ def plot_residuals_vs_position(matches):
     -------
     `matplotlib.figure.Figure`
         Four panels.  Stars of the fit and held-out stars have their own colors, stars that are
-        neither (clipped) are grey; the line is the running median of the first two and the band
+        neither (clipped) are gray; the line is the running median of the first two and the band
         holds the middle 68 % of them.
     """
     x, y, dx, dy = get_columns(matches)

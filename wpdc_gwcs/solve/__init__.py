@@ -1,8 +1,8 @@
-"""One solution from a few stars to a whole camera: terms with learnt priors.
+"""One solution from a few stars to a whole camera: terms with learned priors.
 
 ::
 
-    pairs --observations--> flat columns --linear step--> all terms at once, variances learnt
+    pairs --observations--> flat columns --linear step--> all terms at once, variances learned
         --+--> tables (what is left on the detector) --> spectra and fields of the exposures --+
           +----------------------------- again with the fields ---------------------------------+
         --represent--> PV polynomial + table, attitude, table of the exposure

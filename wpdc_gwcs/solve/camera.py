@@ -108,7 +108,7 @@ def solve(
         Add the residuals of these exposures to those of ``solution`` and make its table anew.
     pool_attitudes : bool, optional
         Let five or more exposures tell how much scale, rotation and skew really vary between them,
-        and draw each exposure's towards their mean accordingly.
+        and draw each exposure's toward their mean accordingly.
     clip : float, optional
         Pairs with residuals of more than this many robust standard deviations are left out.
     table_choice : dict, optional
@@ -132,7 +132,7 @@ def solve(
     Notes
     -----
     The residual of a pair is a sum of linear terms (`wpdc_gwcs.solve.terms`), each with a Gaussian
-    prior whose variance is learnt:
+    prior whose variance is learned:
 
     .. math:: r = \Phi(x) w + O(\varphi) o + B(\varphi) a_e + \delta_e(\varphi) + noise
 
