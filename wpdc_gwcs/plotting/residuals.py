@@ -33,14 +33,14 @@ def plot_residual_arrows(x, y, dx, dy, *, image_shape, title=None, n_bins=20):
     image_shape : (int, int)
         Shape of the detector, ``(ny, nx)``.
     title : str, optional
-        What the arrows are.
+        Title of the figure.
     n_bins : int, optional
         Cells along each side of the detector.
 
     Returns
     -------
     `matplotlib.figure.Figure`
-        The figure: one arrow per cell that has stars, and the length of the arrow beside it as key.
+        One arrow per cell that has stars, and a key for the length of the arrows.
 
     Examples
     --------
