@@ -39,7 +39,7 @@ _LEAST_SIGMA, _LEAST_COLOR = 1e-9, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where a solution stands.
+    """The state of a solution.
 
     Parameters
     ----------
