@@ -107,7 +107,7 @@ def explain_command(
         mark = "ok" if stage.went_well else "!!"
         for k, line in enumerate(stage.lines):
             typer.echo(f"{stage.name if k == 0 else '':<10}{mark if k == 0 else '':<4}{line}")
-    typer.echo(f"\n{told.frame.name} is {told.status}")
+    typer.echo(f"\n{told.frame.name}: {told.status}")
     for advice in told.advice:
         typer.echo(f"try: {advice}")
     if output is not None:
