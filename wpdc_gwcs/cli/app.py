@@ -25,7 +25,7 @@ __all__ = ["app", "main", "set_verbosity"]
 
 app = typer.Typer(
     name="wpdc",
-    help="Calibrate wide-field frames: image + Gaia in, trustworthy WCS with distortion out.",
+    help="Calibrate the WCS and the distortion of wide-field frames with a catalog such as Gaia.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
