@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 _SMALLEST = 8
 
 # Rounds after which close pairs have shared out their light.
-_PASSES_OF_PAIRS = 6
+_PASSES_OF_PAIRS = 5
 
 # Noise of the sky in electrons below which a gain cannot be that of the pixels: no detector reads
 # out so quietly, and the sky's own photons come on top.  Where the header has the read noise, it is

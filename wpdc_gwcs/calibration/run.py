@@ -58,13 +58,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class CalibrationRun:
-    """Everything a call of `calibrate` found.
+    """The results of a call of `calibrate`.
 
     Parameters
     ----------
     calibrations : tuple of `Calibration`
-        One for each solved frame, in the order of the input; none of a run that leaves them to
-        its files.
+        One for each solved frame, in the order of the input; empty if they are only written to
+        files.
     solutions : dict
         Detector name to `DistortionSolution`.
     failures : dict
@@ -72,11 +72,11 @@ class CalibrationRun:
     summary : `~astropy.table.QTable`
         One row per frame: status, reason, counts, residual statistics, seconds.
     superseded : dict
-        Detector name to the stored solution that an update has found changed, valid until then.
+        Detector name to the stored solution, valid until then, of a detector that has changed.
     cameras : tuple of `Camera`
         One for each group of detectors that were solved together.
     run_id : str
-        Identity of the run, which all files carry that it writes.
+        Identifier of the run, which is in all its files.
     resumed : tuple of str
         Frames that an earlier run had done, whose results were read from its files.
     """
@@ -123,34 +123,34 @@ def calibrate(
     frames : Frame or iterable of Frame
         What `wpdc_gwcs.io.read_frames` returns; names must be unique.
     catalog : path-like, Table, SkyCoord, GaiaArchive or HatsCatalog
-        Reference catalog: whatever `read_catalog` takes, and what it returned; of ``"gaia"``,
-        ``"hats:PATH"`` and large files, the part about the frames is read.
+        Reference catalog: anything that `read_catalog` accepts or returns.  Of ``"gaia"``,
+        ``"hats:PATH"`` and large files, only the part around the frames is read.
     solution : DistortionSolution, Camera or mapping, optional
-        Stored solution (of a camera, or detector name to solution): its distortion is kept; each
-        frame gets its attitude, and a field where its stars speak for one.
+        Stored solution (of a camera, or detector name to solution).  Its distortion is kept; the
+        attitude of each frame is fitted, and a field if there is evidence for one.
     update : bool, optional
-        Merge the new frames into the stored solution, and let it follow a change, instead of
-        keeping it fixed.
+        Merge the new frames into the stored solution, and adapt it if the detector has changed,
+        instead of keeping it fixed.
     settings : Settings, optional
-        Choices; the defaults work for any camera.
+        Options; the defaults work for any camera.
     jobs : int, optional
         Processes in which frames are measured and matched.
     executor : concurrent.futures.Executor, optional
         Where frames are measured and matched instead, for example
-        ``dask.distributed.Client(...).get_executor()``.  With each frame goes the part of the
-        catalog that it can need, and no more.
+        ``dask.distributed.Client(...).get_executor()``.  Each frame is sent with the part of the
+        catalog that it needs.
     output : path-like, optional
         Folder into which all results are written, made if needed; those of a detector as soon as
         it is solved.
     overwrite : bool, optional
-        Replace files that are there.
+        Replace existing files.
     resume : bool, optional
-        Leave out what a run of the same frames, catalog, settings and versions has written into
-        the folder already, and go on with it.  What is there of other frames stays, with its rows
-        of the summary: a survey may grow night by night.
+        Continue a run in the folder: skip frames that are already done with the same catalog,
+        settings and versions.  Results of other frames are kept, with their rows of the summary,
+        so a survey can grow night by night.
     keep : bool, optional
-        Whether all calibrations are returned.  `False` leaves them to the files of ``output``, and
-        needs memory for the frames that are in work, however many there are.
+        Whether all calibrations are returned.  With `False` they are only written to ``output``,
+        and memory is needed only for the frames in work, however many there are.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` while the run goes on; for the stages of one
         frame, which have no number, as ``progress(stage, 0, 0)``.
@@ -165,25 +165,25 @@ def calibrate(
     DuplicateFrameError
         If two frames have the same name.
     TypeError
-        If what is given is no frame, for example the path of one.
+        If an argument is not a frame, for example if it is a path.
     ValueError
         If there is no frame, or ``update`` is asked for with ``method="paper"``.
     InputError
         If the catalog cannot be used, a file cannot be written or may not be replaced, or a run
-        of other choices is to be resumed.
+        with different settings is to be resumed.
     ClusterError
-        If the executor has nobody left to do the work; what was done is written.
+        If the executor has no workers left; results so far are written.
 
     Warns
     -----
     WPDCWarning
-        If frames that are said to be of one exposure cannot be, see `tie_exposures`.
+        If frames cannot belong to one exposure as their headers claim, see `tie_exposures`.
 
     Notes
     -----
-    All frames of a camera are solved together, and wait for each other in memory.  With a stored
-    ``solution`` that covers all its detectors and is not updated, they come in batches of 16
-    exposures: results are written batch by batch.
+    All frames of a camera are solved together and are kept in memory until then.  With a stored
+    ``solution`` that covers all its detectors and is not updated, they are solved and written in
+    batches of 16 exposures.
 
     References
     ----------

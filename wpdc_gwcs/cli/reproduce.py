@@ -31,7 +31,7 @@ def reproduce_command(
     jobs: Annotated[int, typer.Option(metavar="N", help="Processes that match frames.")] = 1,
     seed: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Another seed, another camera. [default: 9193]"),
+        typer.Option(metavar="N", help="Another seed gives another camera. [default: 9193]"),
     ] = None,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
@@ -39,8 +39,8 @@ def reproduce_command(
 ):
     """Make the tables and figures of the paper, with the literal method and the default one.
 
-    Writes a folder for each part, and results.ecsv: what the paper says, what its method gives to
-    the letter, and what the default gives.
+    Writes a folder for each part, and results.ecsv with the numbers of the paper, of its exact
+    method, and of the default method.
     """
     from wpdc_gwcs.reproduction import FULL, PARTS, QUICK, SEED, reproduce
 
