@@ -86,6 +86,7 @@ def test_summary_has_a_row_per_frame(run):
         "n_pairs", "n_ambiguous", "expected_by_chance", "purity", "completeness", "significance",
         "mean_dx", "sigma_dx", "mean_dy", "sigma_dy", "holdout_sigma_dx", "holdout_sigma_dy",
         "rms_mas", "seconds", "fwhm", "ellipticity", "mismatch", "gain", "noise", "left_out",
+        "epoch",
     ]  # fmt: skip
     assert list(run.summary["status"]) == ["solved"] * 3
     assert np.all(run.summary["sigma_dx"].to_value("pix") < 0.08)

@@ -74,6 +74,16 @@ def test_names_of_positions(ra, dec):
     assert "ref_epoch" not in catalog.colnames
 
 
+def test_damaged_description_of_columns(tmp_path):
+    # What astropy writes of columns with units beyond FITS is YAML in COMMENT cards.
+    path = tmp_path / "c.fits"
+    QTable({"ra": [10.0] * u.deg, "dec": [1.0] * u.deg, "t": Time(["J2016.0"])}).write(path)
+    damaged = path.read_bytes().replace(b"COMMENT datatype:  ", b"COMMENT datatype: [")
+    path.write_bytes(damaged)
+    with pytest.raises(CatalogError, match=r"c.fits: cannot be read as a table: YamlParseError"):
+        read_catalog(path)
+
+
 def test_exact_name_before_capitals():
     catalog = read_catalog(Table({"RA": [1.0], "ra": [2.0], "dec": [3.0]}))
     assert catalog["ra"][0] == 2.0

@@ -1,7 +1,12 @@
 """The reference pages say what the program does: every command, option, default and name."""
 
+import ast
+import importlib
+import inspect
 import re
 import runpy
+import shlex
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -134,3 +139,72 @@ def test_layout_is_that_of_the_import_contract():
     modules = {m for layer in layout["layers"]() for m in layer}
     package = DOCS.parent / "wpdc_gwcs"
     assert all((package / m).is_dir() or (package / f"{m}.py").is_file() for m in modules)
+
+
+PAGES = [
+    page
+    for page in (
+        *sorted(DOCS.rglob("*.rst")),
+        DOCS.parent / "README.rst",
+        DOCS.parent / "CHANGES.rst",
+    )
+    if not {"_build", "api"} & set(page.relative_to(DOCS.parent).parts)
+]
+
+
+def literal_blocks(page, opening):
+    """Dedented text of the blocks that begin with a line like this."""
+    text = page.read_text(encoding="utf-8")
+    for found in re.finditer(rf"^( *).*{opening}\n\n((?:\1 +.*\n|\n)+)", text, re.M):
+        yield textwrap.dedent(found[2])
+
+
+def python_blocks():
+    """Code that is shown but not run: what reads files that are not there."""
+    for page in PAGES:
+        for block in literal_blocks(page, r"\.\. code-block:: python"):
+            yield pytest.param(block, id=f"{page.stem}-{block.split()[-1][:20]}")
+
+
+@pytest.mark.parametrize("code", list(python_blocks()))
+def test_code_that_is_not_run_has_names_that_exist(code):
+    tree = ast.parse(code)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("wpdc_gwcs"):
+            module = importlib.import_module(node.module)
+            assert [a.name for a in node.names if not hasattr(module, a.name)] == []
+    # Keyword arguments of functions that were imported must be theirs.
+    names = {a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in names:
+            function = getattr(wpdc_gwcs, node.func.id, None)
+            if function is not None:
+                parameters = inspect.signature(function).parameters
+                assert [k.arg for k in node.keywords if k.arg not in parameters] == []
+
+
+def shown_commands():
+    """Command lines of `wpdc` on all pages, without what stands for something else."""
+    for page in PAGES:
+        text = "".join(
+            block
+            for opening in (r"::", r"\.\. code-block:: (?:console|text|bash)")
+            for block in literal_blocks(page, opening)
+        )
+        text = re.sub(r" \\\n\s*", " ", text)
+        for line in re.findall(r"^(?:\$ )?(wpdc [a-z].*)$", text, re.M):
+            command = line.split(";")[0].strip()
+            if not re.search(r"\.\.\.|[{(\[]|--version", command):
+                yield pytest.param(command, id=f"{page.stem}: {command}")
+
+
+@pytest.mark.parametrize("line", list(shown_commands()))
+def test_shown_commands_are_understood(line):
+    words = shlex.split(line)[1:]
+    name = max((n for n in COMMANDS if words[: len(n.split())] == n.split()), key=len)
+    command, words = COMMANDS[name], words[len(name.split()) :]
+    known = {option: p for p in command.params for option in p.opts + p.secondary_opts}
+    given = [word for word in words if re.match(r"--?[a-z]", word)]
+    assert [option for option in given if option not in known] == []
+    required = {p.opts[0] for p in command.params if is_option(p) and p.required}
+    assert required <= set(given)

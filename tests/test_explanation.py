@@ -1,12 +1,16 @@
 """What `wpdc explain` and `wpdc show` say, and how results show themselves in a notebook."""
 
+import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from astropy.table import Table
+from astropy.wcs import WCS
 
-from wpdc_gwcs import calibrate, simulate, write
+from wpdc_gwcs import Settings, calibrate, simulate, write
+from wpdc_gwcs.calibration.start import linear_wcs
 from wpdc_gwcs.cli.app import run
 from wpdc_gwcs.description import as_html, describe
 from wpdc_gwcs.explanation import explain_frame
@@ -75,7 +79,7 @@ def test_a_frame_without_an_epoch_and_one_without_stars(sky):
     few = frame.load_sources()[:5]
     told = explain_frame(replace(frame, load_sources=lambda: few), sky.reference)
     assert told.status == "failed"
-    assert "5 of 5 take part" in told.stages[1].lines[0]
+    assert "5 of 5 sources take part" in told.stages[1].lines[0]
     empty = replace(frame, load_sources=lambda: few[:0])
     told = explain_frame(empty, sky.reference)
     assert [s.name for s in told.stages] == ["frame", "sources"]
@@ -173,3 +177,39 @@ def test_what_cannot_be_shown(folder, capsys, arguments, message):
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("what", ["scale", "pointing", "references", "sources", "flat"])
+def test_advice_is_that_of_the_case(sky, what):
+    """What would have helped, or what is missing: not a search in other directions."""
+    frame, stars = sky.exposures[0].frame(), sky.reference
+    settings = Settings()
+    header = sky.exposures[0].header.copy()
+    if what == "scale":
+        for name in ("CD1_1", "CD1_2", "CD2_1", "CD2_2"):
+            header[name] *= 1.3
+        frame = replace(frame, wcs=WCS(header))
+        expected = r"a match was found .*a scale of 0\.\d+ arcsec / px: .*--pixel-scale 0\.\d+"
+    elif what == "pointing":
+        header["CRPIX1"] += 490.0
+        frame = replace(frame, wcs=WCS(header))
+        expected = "a match was found with the header off by .*correct the header"
+    elif what == "references":
+        stars = Table(stars)[:5]
+        expected = "8 reference stars are needed, 5 are in reach"
+    elif what == "sources":
+        few = frame.load_sources()[:4]
+        frame = replace(frame, load_sources=few.copy)
+        expected = "8 sources are needed, 4 take part: take fainter ones .*--solution"
+    else:
+        image = partial(np.full, frame.image_shape, 100.0)
+        frame = replace(frame, load_sources=None, load_image=image)
+        expected = "look at the image: wpdc show .* --output look.png"
+    told = explain_frame(frame, stars, settings)
+    assert told.status == "failed"
+    assert any(re.search(expected, advice) for advice in told.advice), told.advice
+    if what == "scale":
+        # The scale that is named is the one that matches.
+        scale = float(re.search(r"--pixel-scale (\S+)", told.advice[-1])[1])
+        true = linear_wcs(sky.exposures[0].frame().wcs, np.zeros(2)).scale * 3600
+        assert abs(scale / true - 1) < 0.01

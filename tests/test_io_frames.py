@@ -603,6 +603,13 @@ def test_fits_lists_that_tell_their_first_pixel(tmp_path, wcs_file, cards, first
     assert frame.load_sources()["x"][0] == 12.5
 
 
+def test_list_of_matches_of_astrometry_net(tmp_path, wcs_file):
+    table = fits.table_to_hdu(Table({"field_x": [12.5, 30.0], "field_y": [20.0, 10.0]}))
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(tmp_path / "corr.fits")
+    (frame,) = read_frames(tmp_path / "corr.fits", wcs=wcs_file)
+    assert frame.load_sources()["x"].tolist() == [11.5, 29.0]
+
+
 def test_given_by_hand(tmp_path, wcs_file):
     Table({"x": [0.5, 59.0], "y": [1.0, 2.0]}).write(tmp_path / "s.ecsv")
     (frame,) = read_frames(tmp_path / "s.ecsv", wcs=wcs_file, epoch=2001.5, pixel_scale=0.4)

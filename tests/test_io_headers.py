@@ -312,6 +312,23 @@ class TestRefused:
         with pytest.raises(FileFormatError, match=r"must lie in \[-90, 90\] deg, got 91"):
             parse_tan(tpv_header(CRVAL2=91.0))
 
+    @pytest.mark.parametrize("projection", ["-TAN", "-STG", "-TAN-SIP"])
+    @pytest.mark.parametrize("crval1", [-1e30, 721.0, 1e9])
+    def test_a_longitude_of_noise(self, projection, crval1):
+        header = tpv_header(1, CRVAL1=crval1)
+        for axis, name in ((1, "RA--"), (2, "DEC-")):
+            header[f"CTYPE{axis}"] = f"{name}{projection}"
+        for key in [key for key in header if key.startswith("PV")]:
+            del header[key]
+        with pytest.raises(FileFormatError, match="longitude CRVAL must lie within 720"):
+            parse_wcs(header)
+
+    def test_a_longitude_of_another_turn(self):
+        here, there = (parse_wcs(tpv_header(CRVAL1=ra)) for ra in (10.0, 370.0))
+        np.testing.assert_allclose(
+            here.wcs_pix2world(3.0, 4.0, 0), there.wcs_pix2world(3.0, 4.0, 0), rtol=1e-12
+        )
+
     @pytest.mark.parametrize(
         ("code", "message"), [("TAN-SIP", "matrix is singular"), ("ZPN", "Invalid parameters")]
     )
@@ -593,7 +610,10 @@ NOON = Time("2020-09-24T10:21:45", scale="utc")
             (key, NOON.jd)
             for key in ("OBSJD", "JD-OBS", "JD_UTC", "JDSTART", "HJD", "JULDATE", "JD")
         ),
-        *((key, NOON.isot) for key in ("DATE_OBS", "SHUTOPEN", "DATEOBS", "UTDATE", "OBS-DATE")),
+        *(
+            (key, NOON.isot)
+            for key in ("DATE_OBS", "SHUTOPEN", "DATEOBS", "UTDATE", "OBS-DATE", "DATE-BGN")
+        ),
         *((key, NOON.isot) for key in ("DATE_BEG", "EXPSTART", "UTC-OBS", "OBSTIME", "TIME-BEG")),
         *((key, NOON.isot) for key in ("DATE-UTC", "TIMESTAMP", "MIDTIME", "OBSTART", "UTSHUT")),
         ("ESO OBS START", NOON.isot),

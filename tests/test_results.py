@@ -429,7 +429,7 @@ def test_a_run_that_was_killed_is_completed_by_the_next(
             raise Stopped
 
         if moment == "part":
-            patch.setattr(ResultFolder, "_write_state", lambda *a: stopping(None, None))
+            patch.setattr(results_module, "_write_state", lambda *a: stopping(None, None))
         else:
             patch.setattr(results_module, "put_in_place", stopping)
         with pytest.raises(Stopped):

@@ -1,9 +1,8 @@
 """Errors and warnings of wpdc_gwcs.
 
-Every error that a caller may want to catch derives from `WPDCError`.  Two families matter to
-pipelines: input that cannot be used at all (`InputError`; the command line answers with exit status
-2), and a frame that was read but could not be solved (`FrameFailure`; exit status 1, the other
-frames go on).
+Every error that a caller may want to catch derives from `WPDCError`.  There are two kinds: input
+that cannot be used at all (`InputError`; exit status 2 on the command line), and a frame that was
+read but could not be solved (`FrameFailure`; exit status 1, the other frames are not affected).
 """
 
 from astropy.utils.exceptions import AstropyUserWarning
@@ -23,6 +22,7 @@ __all__ = [
     "MatchError",
     "WPDCError",
     "WPDCWarning",
+    "without_frames",
 ]
 
 
@@ -51,7 +51,7 @@ class FileFormatError(InputError):
 
 
 class ClusterError(InputError):
-    """A cluster that was to do the work, and has no scheduler or no worker."""
+    """A cluster that has no scheduler or no worker."""
 
 
 class FrameFailure(WPDCError):
@@ -63,7 +63,20 @@ class DetectionError(FrameFailure):
 
 
 class MatchError(FrameFailure):
-    """The sources could not be matched to the reference catalog with sufficient evidence."""
+    """The sources could not be matched to the reference catalog with sufficient evidence.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong.
+    found : dict, optional
+        Of a match that is further from the header than is allowed: ``shift`` (px), ``rotation``
+        (deg) and ``scale`` (factor) from the header to it.
+    """
+
+    def __init__(self, message="", *, found=None):
+        super().__init__(message)
+        self.found = found
 
 
 class FitError(FrameFailure):
@@ -83,14 +96,14 @@ class FitError(FrameFailure):
 
 
 class InternalError(FrameFailure):
-    """What should not happen to a frame: a mistake of the program, or a process that died.
+    """An unexpected error: a bug of the program, or a process that died.
 
     Parameters
     ----------
     message : str
         What is wrong, in one line.
     details : str, optional
-        Where it happened, for those who mend it.
+        Where it happened, for bug reports.
     """
 
     def __init__(self, message="", details=""):
@@ -107,3 +120,21 @@ class WPDCWarning(AstropyUserWarning):
 
 class CentroidWarning(WPDCWarning):
     """Centroids are of lower quality than asked for: windowed, for example, not PSF-fitted."""
+
+
+def without_frames(error):
+    """Remove the tracebacks from an error that is kept.
+
+    Parameters
+    ----------
+    error : Exception
+        Its tracebacks, and those of what led to it, hold every array of the functions that it came
+        through: of an image, a hundred times what the frame needs.
+
+    Returns
+    -------
+    Exception
+        The same.
+    """
+    error.__traceback__ = error.__context__ = error.__cause__ = None
+    return error

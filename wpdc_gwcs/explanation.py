@@ -22,14 +22,16 @@ from wpdc_gwcs.calibration.matched import (
 from wpdc_gwcs.calibration.measure import measure_sources, rules_of
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs, sky_of
+from wpdc_gwcs.calibration.story import tell_match, tell_sources
 from wpdc_gwcs.catalogs import Region, catalog_source, fill_motions, read_catalog
 from wpdc_gwcs.exceptions import MatchError, WPDCError
-from wpdc_gwcs.selection import left_out
 
 __all__ = ["Explanation", "Stage", "explain_frame"]
 
 # Stars without which no match is tried, and those that make it easy.
 _FEW, _PLENTY = 8, 30
+# Scales that differ by more are the header's fault; a blind search finds less by itself.
+_SCALE_OFF = 0.03
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What became of a frame, and why.
+    """The result for a frame, stage by stage, with reasons.
 
     Parameters
     ----------
@@ -62,9 +64,9 @@ class Explanation:
     status : str
         ``solved``, ``degraded`` or ``failed``.
     reasons : tuple of str
-        What it lacks, or the error.
+        Its limitations, or the error.
     stages : tuple of Stage
-        As far as it came.
+        The stages that were reached.
     advice : tuple of str
         What to try next.
     sources : `~astropy.table.Table` or None
@@ -98,6 +100,7 @@ class _Story:
     def __init__(self, frame, settings):
         self.frame, self.settings = frame, settings
         self.stages, self.advice, self.found = [], [], {}
+        self.in_reach = 0
 
     def tell(self, name, *lines, went_well=True):
         self.stages.append(Stage(name, bool(went_well), tuple(lines)))
@@ -113,7 +116,7 @@ class _Story:
 
 
 def explain_frame(frame, catalog, settings=None):
-    """Go through a frame stage by stage, and tell what was found and what to try.
+    """Go through a frame stage by stage, and describe the results and what to try.
 
     Parameters
     ----------
@@ -127,7 +130,7 @@ def explain_frame(frame, catalog, settings=None):
     Returns
     -------
     Explanation
-        Whatever becomes of the frame; it is solved by itself, without others of its camera.
+        Also if the frame fails; it is solved by itself, without others of its camera.
 
     Raises
     ------
@@ -153,7 +156,7 @@ def explain_frame(frame, catalog, settings=None):
     try:
         sources = with_errors(measure_sources(frame, settings))
     except WPDCError as error:
-        story.advice.append("look at the image: --threshold, --saturation and --gain may be wrong")
+        _advise_on_sources(story, error)
         return story.fail("sources", error)
     usable = _tell_sources(story, sources)
     stars = fill_motions(
@@ -175,7 +178,7 @@ def explain_frame(frame, catalog, settings=None):
     try:
         match = match_frame(frame, stars, settings, sources=sources)
     except MatchError as error:
-        _try_otherwise(story, stars, sources)
+        _advise_on_match(story, stars, sources, error)
         return story.fail("match", error)
     _tell_match(story, match)
     _, calibrations, failures = solve_camera([match], settings)
@@ -206,10 +209,7 @@ def _tell_sources(story, sources):
     rules = rules_of(sources, story.frame, story.settings)
     usable = ~np.any(list(rules.values()), axis=0)
     story.found |= {"sources": sources, "usable": usable}
-    lines = [f"{usable.sum()} of {len(sources)} take part", left_out(rules)]
-    fwhm = sources.meta.get("fwhm")
-    if fwhm is not None and np.isfinite(float(getattr(fwhm, "value", fwhm))):
-        lines.append(f"stars have a FWHM of {float(getattr(fwhm, 'value', fwhm)):.2f} px")
+    lines = tell_sources(sources, story.frame, story.settings)
     story.tell("sources", *lines, went_well=usable.sum() >= _FEW)
     if usable.sum() < _PLENTY:
         options = {
@@ -230,6 +230,7 @@ def _tell_catalog(story, stars, reference, start):
     x, y = start.pixels(np.asarray(reference["ra"]), np.asarray(reference["dec"]))
     story.found["references"] = np.column_stack([x, y])
     inside = int(np.sum((x > 0) & (x < nx) & (y > 0) & (y < ny)))
+    story.in_reach = len(reference)
     lines = [
         f"{len(reference)} of {len(stars)} stars in reach, {inside} on the frame by its header"
     ]
@@ -237,25 +238,18 @@ def _tell_catalog(story, stars, reference, start):
         lines.append("it has no proper motions")
     story.tell("catalog", *lines, went_well=inside >= _FEW)
     n = int(np.sum(story.found["usable"]))
-    if inside > 20 * max(n, 1):
+    if inside > 20 * max(n, 1) and n >= _FEW:
         story.advice.append("the catalog is far deeper than the frame: try --max-mag")
     if n > 20 * max(inside, 1):
-        story.advice.append("the frame is far deeper than the catalog: take a deeper one")
+        story.advice.append(
+            "the frame is far deeper than the catalog: take a deeper one, such as wpdc catalog "
+            f"prepare gaia --around {shlex.quote(story.frame.source)} --output gaia.fits"
+        )
 
 
 def _tell_match(story, match):
-    found = match.diagnostics
     story.found["match"] = match
-    story.tell(
-        "match",
-        f"{found.n_pairs} pairs, {found.expected_by_chance:.1f} expected by chance "
-        f"({found.significance:.0f} sigma), purity {found.purity:.3f}",
-        f"the header is off by {found.shift[0]:.1f}, {found.shift[1]:.1f} px, turned by "
-        f"{found.rotation:.3f} deg, scaled by {found.scale:.5f}"
-        + (", mirrored" if found.parity < 0 else ""),
-        f"{found.n_ambiguous} sources with two candidates left out, pairs scatter by "
-        f"{found.scatter:.2f} px about a smooth mapping",
-    )
+    story.tell("match", *tell_match(match.diagnostics))
 
 
 def _tell_solution(story, calibration):
@@ -271,7 +265,8 @@ def _tell_solution(story, calibration):
         *(f"lacks: {reason}" for reason in reasons),
         went_well=not reasons,
     )
-    if reasons:
+    # What more stars would not mend has its own advice.
+    if any("no epoch" not in reason for reason in reasons):
         story.advice.append(
             "solve it with dithered exposures of the same detector, with the other detectors of "
             "its camera, or with a --solution"
@@ -279,7 +274,53 @@ def _tell_solution(story, calibration):
     return story.end(statistics["status"], reasons)
 
 
-def _try_otherwise(story, stars, sources):
+def _advise_on_sources(story, error):
+    name = shlex.quote(story.frame.source)
+    if story.frame.load_image is None:
+        story.advice.append(f"look at the list: wpdc show {name}")
+    elif "sigma on the image" in str(error):
+        story.advice.append("if there are stars, though faint ones: --threshold 3")
+        story.advice.append(f"look at the image: wpdc show {name} --output look.png")
+    elif "signal-to-noise" in str(error):
+        story.advice.append("take fainter ones: --min-snr 5; if the gain is wrong, --gain")
+    else:
+        story.advice.append(f"look at the image: wpdc show {name} --output look.png")
+
+
+def _advise_on_match(story, stars, sources, error):
+    """Find out why nothing matched, or what would."""
+    n = int(np.sum(story.found["usable"]))
+    if error.found is not None:
+        _advise_on_header(story, stars, sources, error.found)
+    elif story.in_reach < _FEW:
+        story.advice.append(f"{_FEW} reference stars are needed, {story.in_reach} are in reach")
+    elif n < _FEW:
+        story.advice.append(
+            f"{_FEW} sources are needed, {n} take part: take fainter ones (--threshold 3 --min-snr "
+            "5), or solve it with the other detectors of its camera, or with a --solution"
+        )
+    else:
+        _try_otherwise(story, stars, sources)
+
+
+def _advise_on_header(story, stars, sources, found):
+    """Say what the header should be, of a match that is further from it than is allowed."""
+    frame = story.frame
+    scale = found["scale"] * linear_wcs(frame.wcs, header_reference_point(frame)).scale * 3600
+    off = (
+        f"a match was found with the header off by {found['shift'][0]:.0f}, "
+        f"{found['shift'][1]:.0f} px, turned by {found['rotation']:.2f} deg, and a scale of "
+        f"{scale:.5g} arcsec / px"
+    )
+    story.advice.append(
+        f"{off}: if that is right, --pixel-scale {scale:.5g}"
+        if abs(found["scale"] - 1) > _SCALE_OFF
+        else f"{off}: if that is right, correct the header, or give a better one (--wcs HEADER)"
+    )
+    _try_otherwise(story, stars, sources, last=False)
+
+
+def _try_otherwise(story, stars, sources, *, last=True):
     """Find out which other choice would have matched the frame."""
     name, settings = shlex.quote(story.frame.source), story.settings
     trials = {
@@ -300,7 +341,9 @@ def _try_otherwise(story, stars, sources):
             f"{', mirrored' if found.parity < 0 else ''}): wpdc calibrate {name} {option} ..."
         )
         return
-    story.advice.append(
-        "neither a blind search nor fainter stars match: look whether frame and catalog show the "
-        "same sky, and whether the scale is right (--pixel-scale)"
-    )
+    if last:
+        story.advice.append(
+            "neither a blind search nor fainter stars match: look whether frame and catalog show "
+            "the same sky, whether the scale is right (--pixel-scale), and the position angle: "
+            "other angles than multiples of 90 deg are not searched (--wcs HEADER)"
+        )

@@ -1,5 +1,7 @@
 """Which sources take part in a match: the one definition of a usable star."""
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -100,7 +102,10 @@ def judge_sources(sources, *, image_shape=None, max_roundness=MAX_ROUNDNESS, min
         roundness = _column(sources, "roundness")
         if roundness is not None:
             clean = ~np.any(list(rules.values()), axis=0)
-            off, scatter = _roundness_difference(x, y, roundness, snr, clean)
+            off, scatter = _roundness_difference(
+                *(np.ascontiguousarray(v, float).tobytes() for v in (x, y, roundness, snr)),
+                clean.tobytes(),
+            )
             noise = np.hypot(scatter, _ROUNDNESS_NOISE / np.where(snr > 0, snr, np.inf))
             rules["not round"] = np.abs(off) > np.hypot(max_roundness, _N_SIGMA * noise)
     seen = np.zeros(len(x), bool)
@@ -139,11 +144,15 @@ def _column(sources, name):
     return None if column is None else read_numbers(column)[0]
 
 
+# Each stage asks for the same sources, and neighbors are slow to find.
+@lru_cache(maxsize=1)
 def _roundness_difference(x, y, roundness, snr, clean):
     """Difference of the roundness from that of the stars of the frame or of its part, and scatter.
 
-    The scatter is that of bright stars about what is typical of them.
+    The scatter is that of bright stars about what is typical of them.  Columns come as bytes.
     """
+    x, y, roundness, snr = (np.frombuffer(v) for v in (x, y, roundness, snr))
+    clean = np.frombuffer(clean, bool)
     known = clean & np.isfinite(roundness)
     bright = known & ~(snr < _ROUND_SNR)
     known = bright if bright.sum() >= _MIN_ROUND else known
@@ -153,7 +162,7 @@ def _roundness_difference(x, y, roundness, snr, clean):
         return roundness - (np.median(roundness[rows]) if len(rows) > 2 else 0.0), 0.0
     typical = np.full(len(x), _crowded_half(roundness[rows])[0])
     if len(rows) >= _MIN_LOCAL:
-        # Those that another rule leaves out need no judgement by this one.
+        # Those that another rule leaves out need no judgment by this one.
         placed = np.flatnonzero(clean & np.isfinite(x) & np.isfinite(y))
         tree = KDTree(np.column_stack([x[rows], y[rows]]))
         _, near = tree.query(np.column_stack([x[placed], y[placed]]), k=_NEIGHBORS)

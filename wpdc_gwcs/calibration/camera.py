@@ -30,7 +30,7 @@ from wpdc_gwcs.models import deproject
 from wpdc_gwcs.solution import Calibration
 from wpdc_gwcs.solve import Exposure, solve
 
-__all__ = ["cameras_of", "solve_camera"]
+__all__ = ["cameras_of", "exposure_key", "solve_camera"]
 
 log = logging.getLogger(__name__)
 
@@ -70,14 +70,26 @@ def cameras_of(frames):
         return key
 
     for frame in frames:
-        parent[root(("exposure", _exposure_key(frame)))] = root(_detector_key(frame))
+        parent[root(("exposure", exposure_key(frame)))] = root(_detector_key(frame))
     groups = {}
     for frame in frames:
         groups.setdefault(root(_detector_key(frame)), []).append(frame)
     return list(groups.values())
 
 
-def _exposure_key(frame):
+def exposure_key(frame):
+    """Tell what a frame has in common with the others of its exposure.
+
+    Parameters
+    ----------
+    frame : Frame or MatchedFrame
+        The frame.
+
+    Returns
+    -------
+    hashable
+        Its name, if it is on its own.
+    """
     if frame.camera is None or frame.exposure is None:
         return frame.name
     return (frame.camera, frame.exposure)
@@ -198,9 +210,10 @@ def _delivered(group, pairs, result, settings, holdout, solution, failures, bega
         own = [f for f in group if f.detector == name and f.name not in result.rejected]
         if update and name in solution:
             one = _dated(one, own, solution[name])
-        solutions[name] = replace(
-            one, provenance=_provenance(own, one.provenance if update else {})
-        )
+        if update or name not in solution:
+            # A stored one that stays as it is stays that of its own frames.
+            one = replace(one, provenance=_provenance(own, one.provenance if update else {}))
+        solutions[name] = one
     result = replace(result, solutions=solutions)
     calibrations = []
     for frame, found, fit in zip(group, pairs, result.exposures, strict=True):
@@ -390,7 +403,7 @@ def _exposure(frame, pairs, attitude, holdout):
         use=use,
         color=numbers_or_none(ref, "bp_rp"),
         detector=frame.detector,
-        exposure=_exposure_key(frame),
+        exposure=exposure_key(frame),
     )
 
 

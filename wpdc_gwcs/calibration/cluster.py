@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 
 # How often workers are counted, s.
 _PERIOD = 0.5
+# For so long, s, a client has no answer where its machine is busy: nothing to speak of.
+_BUSY = 10.0
 _GO_ON = "what is done is kept: go on with --resume (resume=True)"
 
 
@@ -95,6 +97,15 @@ class _WatchedExecutor(Executor):
         self._ended = threading.Event()
         threading.Thread(target=self._watch, daemon=True).start()
 
+    @property
+    def n_workers(self):
+        """How many tasks are done at a time, at the moment."""
+        try:
+            workers = self._client.scheduler_info(n_workers=-1).get("workers", {})
+        except (OSError, RuntimeError, TimeoutError):
+            return 1
+        return max(1, sum(worker.get("nthreads", 1) for worker in workers.values()))
+
     def submit(self, fn, /, *args, **kwargs):
         future = Future()
         with self._lock:
@@ -127,20 +138,25 @@ class _WatchedExecutor(Executor):
 
     def _watch(self):
         """Done by a thread: count the workers, and give up when there are none for too long."""
-        since = None
+        since, said = None, False
         while not self._ended.wait(_PERIOD):
             if self._has_workers():
-                since = None
-            elif since is None:
-                since = time.monotonic()
-                log.warning(
-                    "%s: all workers of the Dask scheduler are gone; waiting at most %g s",
-                    self._address,
-                    self._timeout,
-                )
-            elif time.monotonic() - since > self._timeout:
+                since, said = None, False
+                continue
+            since = time.monotonic() if since is None else since
+            waited = time.monotonic() - since
+            if waited > self._timeout:
                 self._give_up()
                 return
+            if waited > _BUSY and not said:
+                said = True
+                log.warning(
+                    "%s: no worker of the Dask scheduler is to be seen for %.0f s; waiting at most "
+                    "%g s",
+                    self._address,
+                    waited,
+                    self._timeout,
+                )
 
     def _has_workers(self):
         try:

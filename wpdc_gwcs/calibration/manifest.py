@@ -98,7 +98,7 @@ class Manifest:
         bool
             False also if it cannot be told, of frames that are no files.
         """
-        if not names <= set(self.frames):
+        if not all(name in self.frames for name in names):
             return False
         numbers = {self.frames[name]["group"] for name in names}
         together = {n for n, frame in self.frames.items() if frame["group"] in numbers}
@@ -106,6 +106,47 @@ class Manifest:
             self.frames[n]["input"] is not None
             and self.frames[n]["input"] == other.frames[n]["input"]
             for n in names
+        )
+
+    def groups(self):
+        """Tell which frames are solved together.
+
+        Returns
+        -------
+        list of set of str
+            Their names.
+        """
+        found = {}
+        for name, frame in self.frames.items():
+            found.setdefault(frame["group"], set()).add(name)
+        return list(found.values())
+
+    def after(self, earlier, names):
+        """Manifest that goes on with that of an earlier run.
+
+        Parameters
+        ----------
+        earlier : Manifest
+            The other run, whose identity it has.
+        names : set of str
+            Frames of it that this one does not have, and that stay: they come first.
+
+        Returns
+        -------
+        Manifest
+            With the frames and the inputs of both.
+        """
+        kept = {n: frame for n, frame in earlier.frames.items() if n in names}
+        first = 1 + max((frame["group"] for frame in kept.values()), default=-1)
+        new = {n: {**frame, "group": frame["group"] + first} for n, frame in self.frames.items()}
+        inputs = {one["path"]: one for one in earlier.inputs if kept}
+        inputs |= {one["path"]: one for one in self.inputs}
+        return dataclasses.replace(
+            self,
+            run=earlier.run,
+            created=earlier.created,
+            inputs=list(inputs.values()),
+            frames=kept | new,
         )
 
     def with_states(self, states):
@@ -180,8 +221,8 @@ def plan_run(run_id, groups, *, settings, catalog, catalog_path, solution, updat
         Frames that are solved together.
     settings : Settings
         Choices.
-    catalog : `~astropy.table.Table`
-        Reference catalog as read.
+    catalog : `~astropy.table.Table`, GaiaArchive or HatsCatalog
+        Reference catalog as read, or the whole of which parts are read.
     catalog_path : path-like or None
         Its file, if it came from one.
     solution : DistortionSolution, mapping or None
@@ -316,7 +357,7 @@ def _state_of(file):
 
 def _sum_of_catalog(catalog):
     """Identify a catalog; a part, which is another one for other frames, by what it is of."""
-    identity = identity_of(catalog)
+    identity = getattr(catalog, "identity", None) or identity_of(catalog)
     if identity is not None:
         return {"part_of": identity}
     return {"rows": len(catalog), "sum": _sum_of_table(catalog)}

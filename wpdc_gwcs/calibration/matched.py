@@ -1,6 +1,5 @@
 """One frame, matched to the reference catalog."""
 
-import logging
 import time
 from dataclasses import dataclass
 
@@ -29,6 +28,7 @@ from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
 from wpdc_gwcs.selection import left_out
+from wpdc_gwcs.solution import has_inverse
 from wpdc_gwcs.stages import announce
 
 __all__ = [
@@ -42,12 +42,7 @@ __all__ = [
     "with_errors",
 ]
 
-log = logging.getLogger(__name__)
-
 _ERROR_FLOOR = 0.01  # px
-
-# Scales of the two axes of a header that differ by more are no scales.
-_MOST_CONDITION = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +142,8 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
             blind=settings.blind,
         )
     except MatchError as err:
-        raise MatchError(f"{err} ({left_out(rules_of(sources, frame, settings))})") from err
-    log.info("%s: %d of %d sources matched", frame.name, len(i_src), len(sources))
+        counts = left_out(rules_of(sources, frame, settings))
+        raise MatchError(f"{err} ({counts})", found=err.found) from err
     return MatchedFrame(
         name=frame.name,
         source=frame.source,
@@ -215,7 +210,7 @@ def _start(frame, solution):
     """Linear WCS about which a frame is matched."""
     point = header_reference_point(frame) if solution is None else solution.crpix
     start = linear_wcs(frame.wcs, point)
-    if not np.linalg.cond(start.cd) < _MOST_CONDITION:
+    if not has_inverse(start.cd):
         raise MatchError(
             f"{frame.source}: the starting WCS must be invertible, its matrix is "
             f"{start.cd.tolist()} deg / px at pixel {point.tolist()}"

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 _SMALLEST = 8
 
 # Rounds after which close pairs have shared out their light.
-_PASSES_OF_PAIRS = 6
+_PASSES_OF_PAIRS = 5
 
 # Noise of the sky in electrons below which a gain cannot be that of the pixels: no detector reads
 # out so quietly, and the sky's own photons come on top.  Where the header has the read noise, it is
@@ -62,7 +62,8 @@ def measure_sources(frame, settings=None):
     `~astropy.table.Table`
         Columns ``x``, ``y`` (px, zero based) and what else was measured.  Of an image, the meta
         data hold ``fwhm`` (px), ``ellipticity``, ``saturation``, ``noise`` (counts) and, where a
-        PSF was fitted, ``gain`` (electrons per count) and ``mismatch`` (of the PSF, relative).
+        PSF was fitted, ``gain`` (electrons per count), ``gain_from`` (``given``, ``header`` or
+        ``noise``) and ``mismatch`` (of the PSF, relative).
 
     Raises
     ------
@@ -115,7 +116,9 @@ def measure_sources(frame, settings=None):
         if epsf is not None:
             noise = measure_noise(background, detected, epsf)
             wrong = settings.gain is None and _contradicts(gain, noise)
+            origin = "header" if settings.gain is None else "given"
             if gain is None or wrong:
+                origin = "noise"
                 measured = _measure_gain(background, detected, noise)
                 if wrong:
                     why = f"the noise in its stars is that of a gain of {measured:.3g}"
@@ -125,7 +128,11 @@ def measure_sources(frame, settings=None):
                 if wrong:
                     epsf = measure_psf(background, detected, gain=gain)
             detected, sources = _fit_psf(background, detected, epsf, gain, settings.threshold)
-            sources.meta.update(gain=noise.gain if gain is None else gain, mismatch=noise.mismatch)
+            sources.meta.update(
+                gain=noise.gain if gain is None else gain,
+                gain_from=origin,
+                mismatch=noise.mismatch,
+            )
     sources.meta["noise"] = background.noise
     if settings.min_snr == 0:
         return sources

@@ -5,14 +5,22 @@ import os
 import shutil
 import stat
 import tempfile
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from astropy.table import Table
 
+from wpdc_gwcs.calibration.journal import find_journals, read_journal, write_entry
 from wpdc_gwcs.calibration.manifest import files_of, read_manifest
-from wpdc_gwcs.calibration.staging import FRAME_SUFFIXES, REMOVED, clean, lock, put_in_place
+from wpdc_gwcs.calibration.staging import (
+    FRAME_SUFFIXES,
+    MANIFEST,
+    REMOVED,
+    SUMMARY,
+    clean,
+    lock,
+    put_in_place,
+)
 from wpdc_gwcs.calibration.summary import summarize
 from wpdc_gwcs.exceptions import InputError
 
@@ -20,7 +28,11 @@ __all__ = ["ERRORS", "Outcome", "ResultFolder", "file_stem", "superseded_name"]
 
 #: Where the details of internal errors are.
 ERRORS = "errors.log"
-_SUMMARY, _MANIFEST = "summary.ecsv", "manifest.json"
+# The manifest and the summary are written anew when they lack this share of themselves: ten times
+# in all while they grow to their 2.6-fold, however many frames there are.
+_SHARE = 0.1
+# More detectors than any camera has.
+_ALL = 1 << 30
 
 
 def file_stem(name):
@@ -107,6 +119,8 @@ class ResultFolder:
         self._done = set()  # frames that the resumed run has done
         self._mine = set()  # files that may be replaced
         self._rows = {}
+        self._n_written = 0  # rows of the summary that is there
+        self._shared = {}  # files of several frames that are there, and of how many detectors
         self._names = {}  # first frame of a group to the files that the group may write
         self._inputs = set()
         self._lock = None
@@ -122,13 +136,50 @@ class ResultFolder:
                 f"{self.folder}: the output folder must be writable: {reason}"
             ) from err
         self._lock = lock(self.folder)
-        clean(self.folder)
+        try:
+            self._tidy()
+        except BaseException:
+            self._release()
+            raise
         return self
 
     def __exit__(self, *_):
+        try:
+            self._tidy()
+        finally:
+            self._release()
+
+    def _tidy(self):
+        """Complete what was begun, and write what the journals say into manifest and summary."""
         clean(self.folder)
+        for run, journal in find_journals(self.folder).items():
+            path = self.folder / MANIFEST
+            manifest = read_manifest(path) if path.exists() else None
+            if manifest is not None and manifest.run == run:
+                states, new = read_journal(journal)
+                rows = _read_rows(self.folder / SUMMARY, run) | new
+                _write_state(self.folder, manifest.with_states(states), rows)
+            journal.unlink()
+
+    def _release(self):
         if self._lock is not None:
             os.close(self._lock)
+
+    def earlier_groups(self):
+        """Tell which frames the run that is to be resumed has solved together.
+
+        Returns
+        -------
+        list of set of str
+            Their names; empty without such a run.
+
+        Raises
+        ------
+        FileFormatError
+            If its manifest is damaged.
+        """
+        path = self.folder / MANIFEST
+        return read_manifest(path).groups() if self._resume and path.exists() else []
 
     def check(self, groups, *, inputs=()):
         """Check all names before the work.
@@ -146,7 +197,7 @@ class ResultFolder:
             If two things have one file, if a file is there and may not be replaced, or if an input
             would be replaced.
         """
-        cameras = Counter()
+        cameras = {}
         for group in groups:
             self._names[group[0].name] = _names_of(group, cameras)
         _check_distinct(self._names.values())
@@ -158,7 +209,7 @@ class ResultFolder:
 
     def _check_free(self, groups):
         names = [n for g in groups if not self.is_done(g) for n in self._names[g[0].name]]
-        for name in [*names, _SUMMARY, _MANIFEST]:
+        for name in [*names, SUMMARY, MANIFEST]:
             self._require_free(name)
 
     def begin(self, groups, plan):
@@ -184,8 +235,8 @@ class ResultFolder:
         """
         self._manifest = plan
         if self._resume:
-            if (self.folder / _MANIFEST).exists():
-                self._continue(read_manifest(self.folder / _MANIFEST), groups)
+            if (self.folder / MANIFEST).exists():
+                self._continue(read_manifest(self.folder / MANIFEST), groups)
             self._check_free(groups)
         return self._manifest
 
@@ -218,8 +269,7 @@ class ResultFolder:
                 f"{self.folder}: a run is resumed with the same choices: {'; '.join(found)}; "
                 "--overwrite begins anew"
             )
-        summary = self.folder / _SUMMARY
-        rows = _read_rows(summary, earlier.run) if summary.exists() else {}
+        rows = _read_rows(self.folder / SUMMARY, earlier.run)
         states = {}
         for group in groups:
             members = {frame.name for frame in group}
@@ -233,14 +283,37 @@ class ResultFolder:
                 self._done |= members
                 states |= {n: earlier.frames[n] for n in members}
                 self._rows |= {n: rows[n] for n in members}
-        self._mine |= {_SUMMARY, _MANIFEST}
-        plan = replace(plan, run=earlier.run, created=earlier.created)
-        self._manifest = plan.with_states(
+        self._mine |= {SUMMARY, MANIFEST}
+        others = self._others(earlier, groups, rows)
+        self._rows = {name: rows[name] for name in others} | self._rows
+        self._manifest = plan.after(earlier, others).with_states(
             {
                 n: {key: state[key] for key in ("state", "error", "files")}
                 for n, state in states.items()
             }
         )
+        files = {name for n in {*others, *states} for name in earlier.frames[n]["files"]}
+        self._shared = {n: _ALL for n in files if not n.endswith(FRAME_SUFFIXES)}
+        if earlier.solution is not None and not earlier.update:
+            # It is the same in all files of its detector.
+            self._mine |= set(self._shared)
+
+    def _others(self, earlier, groups, rows):
+        """Frames that an earlier run has done, that are not given now, and that stay."""
+        given = {frame.name for group in groups for frame in group}
+        written = {name for g in groups if not self.is_done(g) for name in self._names[g[0].name]}
+        if earlier.solution is not None and not earlier.update:
+            written = {name for name in written if name.endswith(FRAME_SUFFIXES)}
+        others = set()
+        for names in earlier.groups():
+            files = {name for n in names for name in earlier.frames[n].get("files") or ()}
+            if (
+                names.isdisjoint(given)
+                and files.isdisjoint(written)
+                and all(earlier.is_done(n) and n in rows for n in names)
+            ):
+                others |= names
+        return others
 
     def is_done(self, group):
         """Tell whether frames were done by the run that is resumed, and are left out.
@@ -257,13 +330,15 @@ class ResultFolder:
         """
         return group[0].name in self._done
 
-    def load(self, group):
+    def load(self, group, *, keep=True):
         """Read what is done already.
 
         Parameters
         ----------
         group : list of Frame
             Frames for which `is_done` is true.
+        keep : bool, optional
+            Whether calibrations are returned, or read to see that they are whole, and forgotten.
 
         Returns
         -------
@@ -296,7 +371,8 @@ class ResultFolder:
                 runs = [found.provenance.get("run"), *(t.meta.get("run") for t in tables.values())]
                 if any(one != run for one in runs):
                     raise InputError(f"{path}: must be of the run {run} with its tables, is not")
-                outcome.calibrations.append(replace(found, **tables))
+                if keep:
+                    outcome.calibrations.append(replace(found, **tables))
             elif name.endswith(".solution.asdf"):
                 found = read(path)
                 current = name == f"{file_stem(found.detector)}.solution.asdf"
@@ -337,9 +413,15 @@ class ResultFolder:
                 }
                 for row in outcome.rows
             }
-            rows = self._rows | {row["frame"]: row for row in outcome.rows}
+            new = {row["frame"]: row for row in outcome.rows}
+            rows = self._rows | new
             manifest = self._manifest.with_states(states)
-            self._write_state(part, manifest, rows)
+            n_written = self._n_written
+            if len(rows) - n_written > _SHARE * n_written:
+                _write_state(part, manifest, rows)
+                n_written = len(rows)
+            else:
+                write_entry(part, states, new)
             for path in part.iterdir():
                 if path.name != REMOVED:
                     self._require_free(path.name)
@@ -349,7 +431,7 @@ class ResultFolder:
             raise InputError(str(err).replace(str(part), str(self.folder))) from err
         except OSError as err:
             raise InputError(f"{self.folder}: cannot be written to: {err.strerror or err}") from err
-        self._manifest, self._rows = manifest, rows
+        self._manifest, self._rows, self._n_written = manifest, rows, n_written
         self._mine |= {path.name for path in part.with_suffix(".done").iterdir()}
         put_in_place(part.with_suffix(".done"), self.folder)
 
@@ -368,6 +450,7 @@ class ResultFolder:
                     files[calibration.frame].append(name)
             write(_of_run(calibration, run), part / f"{calibration.frame}.wcs.asdf")
             files[calibration.frame].append(f"{calibration.frame}.wcs.asdf")
+        # What several frames share; of a stored solution it is the same in all batches.
         shared = {f"{file_stem(s.detector)}.solution.asdf": s for s in outcome.solutions.values()}
         shared |= {superseded_name(s): s for s in outcome.superseded.values()}
         camera_name = next(
@@ -378,7 +461,10 @@ class ResultFolder:
             name = camera_name if k == 0 else f"{file_stem(group[0].name)}-{k + 1}.camera.asdf"
             shared[name] = replace(camera, files=of)
         for name, one in shared.items():
-            write(_of_run(one, run), part / name)
+            n_detectors = len(getattr(one, "detectors", (one,)))
+            if n_detectors > self._shared.get(name, 0):
+                write(_of_run(one, run), part / name)
+                self._shared[name] = n_detectors
         # What an earlier run left for a frame that now fails, or has no sources of its own, would
         # pass for its own.
         removed = [
@@ -389,13 +475,6 @@ class ResultFolder:
         ]
         (part / REMOVED).write_text(json.dumps(removed), encoding="utf-8")
         return files, list(shared)
-
-    def _write_state(self, part, manifest, rows):
-        from wpdc_gwcs.io import write_table
-
-        done = [rows[name] for name in manifest.frames if name in rows]
-        write_table(summarize(done, manifest.run), part / _SUMMARY)
-        (part / _MANIFEST).write_text(manifest.to_json(), encoding="utf-8")
 
     def log(self, name, error):
         """Keep the details of an internal error.
@@ -434,9 +513,13 @@ def _names_of(group, cameras):
         )
     if len(detectors) > 1:
         camera = next((frame.camera for frame in group if frame.camera), "camera")
-        cameras[camera] += 1
         # Exposures that have no detector in common are solved apart.
-        mark = f"-{cameras[camera]}" if cameras[camera] > 1 else ""
+        apart = cameras.setdefault(camera, [])
+        k = next((k for k, known in enumerate(apart) if known & detectors), len(apart))
+        if k == len(apart):
+            apart.append(set())
+        apart[k] |= detectors
+        mark = f"-{k + 1}" if k else ""
         names[f"{file_stem(camera)}{mark}.camera.asdf"] = f"camera {camera!r}{mark}"
     return names
 
@@ -463,10 +546,22 @@ def _of_run(result, run):
     return replace(result, provenance={**result.provenance, "run": run})
 
 
+def _write_state(folder, manifest, rows):
+    """Write the summary and the manifest, each as a whole."""
+    from wpdc_gwcs.io import atomic_path, write_table
+
+    done = [rows[name] for name in manifest.frames if name in rows]
+    write_table(summarize(done, manifest.run), folder / SUMMARY, overwrite=True)
+    with atomic_path(folder / MANIFEST, overwrite=True) as temporary:
+        temporary.write_text(manifest.to_json(), encoding="utf-8")
+
+
 def _read_rows(path, run):
     """Rows of the summary of a run, by frame; none if it is of another run."""
     from wpdc_gwcs.io import read_table
 
+    if not path.exists():
+        return {}
     table = read_table(path)
     if table.meta.get("run") != run:
         return {}

@@ -14,6 +14,7 @@ import os
 import re
 import shutil
 
+from wpdc_gwcs.calibration.journal import ENTRY, add_to_journal, journal_of
 from wpdc_gwcs.exceptions import InputError
 
 try:
@@ -21,10 +22,20 @@ try:
 except ImportError:  # a system without locks of this kind
     fcntl = None
 
-__all__ = ["FRAME_SUFFIXES", "REMOVED", "clean", "lock", "put_in_place"]
+__all__ = [
+    "FRAME_SUFFIXES",
+    "MANIFEST",
+    "REMOVED",
+    "SUMMARY",
+    "clean",
+    "lock",
+    "put_in_place",
+]
 
 #: Files of a frame, in the order in which they get their names.
 FRAME_SUFFIXES = (".sources.ecsv", ".matches.ecsv", ".wcs.asdf")
+#: Files of the run.
+SUMMARY, MANIFEST = "summary.ecsv", "manifest.json"
 #: File of a set that names those that are to go.
 REMOVED = "removed.json"
 # Hidden folders of our own, not those of others.
@@ -99,10 +110,16 @@ def put_in_place(done, folder):
         removed = []
     for name in removed:
         (folder / name).unlink(missing_ok=True)
+    journal = journal_of(folder, done.name.split(".")[1])
     # By frame, so that its files come as one as nearly as can be.
     for name in sorted(os.listdir(done), key=_order):
-        if name != REMOVED:
+        if name == ENTRY:
+            add_to_journal(done / name, journal)
+        elif name != REMOVED:
             os.replace(done / name, folder / name)
+            if name == MANIFEST:
+                # It has all that the journal had to say.
+                journal.unlink(missing_ok=True)
     shutil.rmtree(done)
 
 
@@ -110,4 +127,5 @@ def _order(name):
     for k, suffix in enumerate(FRAME_SUFFIXES):
         if name.endswith(suffix):
             return 0, name.removesuffix(suffix), k
-    return (2 if name in ("summary.ecsv", "manifest.json") else 1), name, 0
+    # The manifest is the last: it says that the rest is there.
+    return {MANIFEST: 3, SUMMARY: 2, ENTRY: 2}.get(name, 1), name, 0

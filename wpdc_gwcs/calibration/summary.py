@@ -7,7 +7,7 @@ from wpdc_gwcs.calibration.measure import quality_of
 
 __all__ = ["summarize", "summary_row"]
 
-_UNITS = {"rms_mas": "mas", "seconds": "s", "fwhm": "pix"}
+_UNITS = {"rms_mas": "mas", "seconds": "s", "fwhm": "pix", "epoch": "yr"}
 
 
 def summary_row(frame, result, calibration, failure, settings):
@@ -57,7 +57,8 @@ def summary_row(frame, result, calibration, failure, settings):
         row[f"holdout_{name}"] = outside.get(name, np.nan)
     row["rms_mas"] = statistics.get("rms_mas", np.nan)
     row["seconds"] = statistics.get("seconds", result.seconds)
-    return row | quality_of(frame, result.sources, settings)
+    epoch = np.nan if frame.epoch is None else float(frame.epoch)
+    return row | quality_of(frame, result.sources, settings) | {"epoch": epoch}
 
 
 def summarize(rows, run_id):

@@ -39,6 +39,7 @@ from wpdc_gwcs.exceptions import (
     InternalError,
     WPDCError,
     WPDCWarning,
+    without_frames,
 )
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.threads import one_blas_thread
@@ -47,6 +48,10 @@ __all__ = ["Task", "Workers", "internal_error", "stored_of"]
 
 # A process may die of something that passes, memory that others took for example.
 _TRIES = 2
+# Tasks in hand for each that works on them: none waits for work, few results for their turn.
+_IN_HAND = 2
+# Those who work for an executor that does not tell how many they are.
+_WORKERS = 32
 # Processes that are killed end at once; one that does not in this time, s, is left to the system.
 _PATIENCE = 5.0
 
@@ -132,7 +137,8 @@ def match_or_fail(task):
         stored = _stored_for(task.solution, frame)
         if sources is None:
             sources = measure_sources(frame, task.settings)
-        return match_frame(frame, task.catalog, task.settings, sources=sources, solution=stored)
+        found = match_frame(frame, task.catalog, task.settings, sources=sources, solution=stored)
+        return replace(found, seconds=time.perf_counter() - began)
     except WPDCError as err:
         error = err
     except Exception as problem:  # noqa: BLE001  One frame is not to end the run of all.
@@ -140,7 +146,7 @@ def match_or_fail(task):
     n_sources = 0 if sources is None else len(sources)
     # Nobody can tell what is wrong with sources that met an internal error.
     kept = None if isinstance(error, InternalError) else sources
-    return FailedFrame(error, n_sources, time.perf_counter() - began, kept)
+    return FailedFrame(without_frames(error), n_sources, time.perf_counter() - began, kept)
 
 
 def _stored_for(solution, frame):
@@ -172,6 +178,7 @@ class Workers:
 
     def __init__(self, jobs, executor=None):
         self._executor = executor
+        self._jobs = jobs
         self._threads = None
         self._mine = threading.local()
         self._processes = set()
@@ -194,6 +201,13 @@ class Workers:
             process.end()
         if self._threads is not None:
             self._threads.shutdown(cancel_futures=True)
+
+    @property
+    def in_hand(self):
+        """How many tasks should be in hand, so that nobody waits for one."""
+        if self._executor is not None:
+            return _IN_HAND * getattr(self._executor, "n_workers", _WORKERS)
+        return _IN_HAND * self._jobs if self._threads is not None else 0
 
     def submit(self, task):
         """Have a task done.

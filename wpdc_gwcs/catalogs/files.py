@@ -14,8 +14,13 @@ from xml.parsers.expat import ExpatError
 
 from astropy.io import fits
 from astropy.io.ascii import InconsistentTableError
+from astropy.io.ascii.cparser import CParserError
+from astropy.io.ascii.ipac import IpacFormatError, IpacFormatErrorDBMS
 from astropy.io.registry import IORegistryError
 from astropy.table import Table
+from astropy.table.meta import YamlParseError
+from astropy.table.mixins.registry import MixinRegistryError
+from astropy.units import UnitsError
 from yaml import YAMLError
 
 from wpdc_gwcs.catalogs.parquet import read_parquet
@@ -52,9 +57,16 @@ READ_ERRORS = (
     AssertionError,
     ImportError,
     MemoryError,
+    ReferenceError,
+    CParserError,
     ExpatError,
     IORegistryError,
+    IpacFormatError,
+    IpacFormatErrorDBMS,
+    MixinRegistryError,
+    UnitsError,
     YAMLError,
+    YamlParseError,
     csv.Error,
     fits.VerifyError,
     lzma.LZMAError,

@@ -1,13 +1,13 @@
 """Weighted least squares for the position and flux of many stars at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import percentile_filter
 
 from wpdc_gwcs import kernels
-from wpdc_gwcs.centroids._profile import cutouts
+from wpdc_gwcs.cutouts import cut_squares, on_image
 
 __all__ = [
     "Field",
@@ -15,6 +15,7 @@ __all__ = [
     "Stars",
     "fit_radius",
     "fit_stars",
+    "normal_step",
     "star_like",
 ]
 
@@ -58,12 +59,15 @@ class Field:
         True where a pixel must not be used.
     photons : (ny, nx) ndarray or None
         As in `Sky`; None for pixels of one response.
+    full : (ny, nx) bool ndarray or None
+        More pixels that must not be used: those that are saturated.
     """
 
     image: np.ndarray
     rms: np.ndarray
     mask: np.ndarray | None
     photons: np.ndarray | None = None
+    full: np.ndarray | None = None
 
     def rows(self, start, stop, *, image):
         """Take some rows, with another image for theirs.
@@ -80,10 +84,11 @@ class Field:
         Field
             The rows.
         """
-        mask, photons = (
-            None if values is None else values[start:stop] for values in (self.mask, self.photons)
+        mask, photons, full = (
+            None if values is None else values[start:stop]
+            for values in (self.mask, self.photons, self.full)
         )
-        return Field(image, self.rms[start:stop], mask, photons)
+        return Field(image, self.rms[start:stop], mask, photons, full)
 
     def cut(self, stars, half, radius):
         """Cut out the surroundings of stars.
@@ -109,14 +114,19 @@ class Field:
             Noise of the background.
         """
         xc, yc = np.rint(stars.x).astype(int), np.rint(stars.y).astype(int)
-        pixels, use = cutouts(self.image, xc, yc, half)
         step = np.arange(-half, half + 1)
-        use &= (np.hypot(step[:, None], step) <= radius).ravel()
-        if self.mask is not None:
-            use &= ~cutouts(self.mask, xc, yc, half)[0]
-        variance = cutouts(self.rms, xc, yc, half)[0].astype(float) ** 2
-        photons = 1.0 if self.photons is None else cutouts(self.photons, xc, yc, half)[0]
-        return xc, yc, pixels.astype(float), use, Sky(variance, photons)
+
+        def cut(image):
+            return cut_squares(image, xc, yc, half).reshape(len(xc), len(step) ** 2)
+
+        use = on_image(self.image.shape, xc, yc, half) & (np.hypot(step[:, None], step) <= radius)
+        use = use.reshape(len(xc), len(step) ** 2)
+        for hidden in (self.mask, self.full):
+            if hidden is not None:
+                use &= ~cut(hidden)
+        variance = cut(self.rms).astype(float) ** 2
+        photons = 1.0 if self.photons is None else cut(self.photons)
+        return xc, yc, cut(self.image).astype(float), use, Sky(variance, photons)
 
 
 class Stars(NamedTuple):
@@ -189,6 +199,13 @@ class StarFits:
         x, y, flux, *rest = columns
         return StarFits(Stars(x, y, flux), *rest)
 
+    def moved(self, rows, stars):
+        """Return these fits with other positions and fluxes of some."""
+        columns = [old.copy() for old in self.stars]
+        for column, new in zip(columns, stars, strict=True):
+            column[rows] = new
+        return replace(self, stars=Stars(*columns))
+
     def _columns(self):
         return *self.stars, self.covariance, self.chi2, self.valid
 
@@ -249,15 +266,15 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
     x, y, flux = (np.array(v, dtype=float) for v in stars)
     shares = profile.shares(x, y)
     flux = np.maximum(flux, 1e-6)
-    x0, y0 = x.copy(), y.copy()
+    x0, y0, positions = x.copy(), y.copy(), noise.of_positions
     converged = np.zeros(len(x), bool)
     active = np.arange(len(x))
     for _ in range(_MAX_ITERATIONS):
         basis = profile.evaluate(
             x[active] - xc[active], y[active] - yc[active], half, shares[active]
         )
-        step, *_rest = _normal_step(
-            basis, flux[active], pixels[active], use[active], sky.take(active), noise
+        step, *_rest = normal_step(
+            basis, flux[active], pixels[active], use[active], sky.take(active), positions
         )
         shift = np.clip(step[:, :2], -_MAX_STEP, _MAX_STEP)
         x[active] += shift[:, 0]
@@ -276,15 +293,38 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
         # Slow but close enough: what is left is far below the error.
         converged[active] = np.abs(shift[~done & ~away]).max(axis=1, initial=0) < 3e-3
     basis = profile.evaluate(x - xc, y - yc, half, shares)
-    _step, covariance, chi2 = _normal_step(basis, flux, pixels, use, sky, noise)
+    _step, covariance, chi2 = normal_step(basis, flux, pixels, use, sky, positions)
+    if positions.mismatch != noise.mismatch:
+        _step, _covariance, chi2 = normal_step(basis, flux, pixels, use, sky, noise)
     positive = np.einsum("sii->si", covariance).min(axis=1, initial=np.inf) > 0
     valid = converged & positive & np.isfinite(chi2)
     covariance[~valid] = np.nan
     return x, y, flux, covariance, chi2, valid
 
 
-def _normal_step(basis, flux, pixels, use, sky, noise):
-    """Gauss-Newton step (N, 3), covariance (N, 3, 3) and reduced chi square."""
+def normal_step(basis, flux, pixels, use, sky, noise):
+    """Take a Gauss-Newton step of every star.
+
+    Parameters
+    ----------
+    basis : (3, N, n) ndarray
+        Profiles and their derivatives.
+    flux : (N,) ndarray
+        Fluxes.
+    pixels, use, sky
+        As from `Field.cut`.
+    noise : Noise
+        Variance of the pixels.
+
+    Returns
+    -------
+    step : (N, 3) ndarray
+        Steps of x, y and flux.
+    covariance : (N, 3, 3) ndarray
+        Their covariance; NaN where the equations are singular.
+    chi2 : (N,) ndarray
+        Chi square per degree of freedom.
+    """
     n = len(flux)
     step, covariance, chi2 = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
     photons = None if np.isscalar(sky.photons) else np.ascontiguousarray(sky.photons, dtype=float)

@@ -6,10 +6,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-__all__ = ["Noise", "NoiseBins", "bin_noise", "estimate_noise", "least_gain"]
+from wpdc_gwcs.centroids._inverses import inverses
+
+__all__ = ["Noise", "NoiseBins", "bin_noise", "bin_odd_noise", "estimate_noise", "least_gain"]
 
 # Error of the profile below which nobody's data can tell.
-_MIN_MISMATCH = 0.002
+_MIN_MISMATCH = 0.0005
+
+# Median of a chi square with four degrees of freedom, for each of them; stars in a bin.
+_MEDIAN_OF_FOUR, _STARS_OF_BIN = 0.839, 15
 
 # Noise of stars shows where it is so many times that of the sky, in so many bins.
 _ABOVE_SKY, _MIN_BINS = 2.0, 3
@@ -25,6 +30,8 @@ class Noise:
         Counts per electron.
     mismatch : float
         Error of the profile at its peak, relative to its value there.
+    asymmetry : float or None
+        That part of it that is odd about the star; None for all of it.
 
     Notes
     -----
@@ -32,10 +39,20 @@ class Noise:
     model's counts.  The error of the profile has the form of photon noise, so that the brightest
     stars are fitted with the same relative weights as those with photon noise alone; the same
     relative error everywhere would shift them by whatever asymmetry the wings have.
+
+    An error of the width, or of any ring about the star, makes the fit worse and moves nobody: the
+    derivatives by the position are odd about the star, and the sums with what is even vanish.
     """
 
     inverse_gain: float = 0.0
     mismatch: float = 0.02
+    asymmetry: float | None = None
+
+    @property
+    def of_positions(self):
+        """The noise that moves stars, for the weights and errors of their positions."""
+        odd = self.mismatch if self.asymmetry is None else self.asymmetry
+        return Noise(self.inverse_gain, odd)
 
     def variance(self, sky, model):
         """Variance for pixels of given sky and model counts."""
@@ -101,7 +118,7 @@ def bin_noise(field, profile, noise, stars, *, radius, modes=(), own=None):
     good = use.sum(axis=1) >= 2 * n
     normal[~good] = np.eye(n)
     # A fit takes part of the scatter away, most where few pixels decide: the leverage.
-    inverse = np.linalg.pinv(normal)
+    inverse = inverses(normal)
     leverage = weight * np.einsum("sip,sij,sjp->sp", jacobian, inverse, jacobian)
     residual = pixels - model
     if own:
@@ -114,12 +131,84 @@ def bin_noise(field, profile, noise, stars, *, radius, modes=(), own=None):
     square = (model * model.max(axis=1, keepdims=True))[use]
     photons, variance = (model * sky.photons)[use], sky.variance[use]
     order = np.argsort(square)
-    bins = np.array_split(order, int(np.clip(len(order) // 50, 1, 40)))
+    values = np.stack([residual2, variance, photons, square])[:, order]
+    measured, *means = _medians(values, int(np.clip(len(order) // 50, 1, 40)))
     # 1.4826 MAD squared = median of the squares / 0.4549
-    measured = np.array([np.median(residual2[b]) for b in bins]) / 0.4549 + 1e-30
-    return NoiseBins(
-        measured, *(np.array([np.median(v[b]) for b in bins]) for v in (variance, photons, square))
+    return NoiseBins(measured / 0.4549 + 1e-30, *means)
+
+
+def _medians(values, n_bins):
+    """Medians (..., n_bins) of values (..., N) in bins of as many each, the first ones one more."""
+    size, more = divmod(values.shape[-1], n_bins)
+    split = more * (size + 1)
+    parts = values[..., :split], values[..., split:]
+    shapes = (more, size + 1), (n_bins - more, size)
+    return np.concatenate(
+        [
+            np.median(part.reshape(*values.shape[:-1], *shape), axis=-1)
+            for part, shape in zip(parts, shapes, strict=True)
+        ],
+        axis=-1,
     )
+
+
+def bin_odd_noise(field, profile, noise, stars, modes, *, radius, own=None):
+    r"""Measure the noise in what is odd about well measured stars, as the shift of a star is.
+
+    Parameters
+    ----------
+    field, profile, stars, radius, own
+        As for `bin_noise`.
+    noise : Noise
+        Its photons count.
+    modes : sequence of Profile
+        Four changes of the profile that are odd about the star.
+
+    Returns
+    -------
+    NoiseBins or None
+        Variances in units of those by sky and photons; None where there are too few stars.
+
+    Notes
+    -----
+    The amplitudes of the modes are fitted with position and flux.  Their chi square is that of sky
+    and photons, and grows with the square of the profile's error by :math:`\mathrm{tr}(N^{-1} B) /
+    4`, where N is the normal matrix and B what the form of that error makes of it.
+    """
+    if len(stars.x) < 2 * _STARS_OF_BIN:
+        return None
+    half = int(np.ceil(radius))
+    xc, yc, pixels, use, sky = field.cut(stars, half, radius)
+    if own is not None:
+        pixels += own.light(profile, xc, yc, half)
+    basis = profile.evaluate(stars.x - xc, stars.y - yc, half, profile.shares(stars.x, stars.y))
+    flux = stars.flux[:, None]
+    model = flux * basis[0]
+    weight = use / Noise(noise.inverse_gain, 0.0).variance(sky, model)
+    one = np.ones((len(flux), 1))
+    odd = [m.evaluate(stars.x - xc, stars.y - yc, half, one, gradient=False)[0] for m in modes]
+    fitted = np.stack([basis[0], flux * basis[1], flux * basis[2]], axis=1)
+    odd = flux[:, None] * np.stack(odd, axis=1)
+    weighted = fitted * weight[:, None]
+    normal = weighted @ fitted.transpose(0, 2, 1)
+    odd -= (inverses(normal) @ (weighted @ odd.transpose(0, 2, 1))).transpose(0, 2, 1) @ fitted
+    weighted = odd * weight[:, None]
+    left = weighted @ odd.transpose(0, 2, 1)
+    inverse = inverses(left)
+    right = (weighted @ (pixels - model)[:, :, None])[:, :, 0]
+    square = np.maximum(model, 0) * model.max(axis=1, keepdims=True)
+    error = (weighted * square[:, None]) @ weighted.transpose(0, 2, 1)
+    square = np.einsum("sij,sji->s", inverse, error) / 4
+    # What all stars have in common shifts them alike, which no star can tell from where it is.
+    share = 1 / (1 + noise.mismatch**2 * square)
+    common = np.linalg.pinv(np.einsum("s,sij->ij", share, left)) @ (share @ right)
+    right -= left @ common
+    chi2 = np.einsum("si,sij,sj->s", right, inverse, right) / 4
+    order = np.argsort(square)
+    bins = np.array_split(order, int(np.clip(len(order) // _STARS_OF_BIN, 1, 40)))
+    measured = np.array([np.median(chi2[b]) for b in bins]) / _MEDIAN_OF_FOUR + 1e-30
+    ones = np.ones(len(bins))
+    return NoiseBins(measured, ones, ones, np.array([np.median(square[b]) for b in bins]))
 
 
 def estimate_noise(bins, gain=None):

@@ -8,7 +8,14 @@ from scipy.ndimage import spline_filter, uniform_filter1d
 
 from wpdc_gwcs import kernels
 
-__all__ = ["Models", "Profile", "cutouts", "moffat_samples", "spline_coefficients", "spline_taps"]
+__all__ = [
+    "Models",
+    "Profile",
+    "moffat_samples",
+    "shift_matrix",
+    "spline_coefficients",
+    "spline_taps",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +64,26 @@ class Profile:
         c = np.pad(self.coefficients, ((0, 0), (1, 1), (1, 1)))
         c = (c[:, :-2] + 4 * c[:, 1:-1] + c[:, 2:]) / 6
         return (c[:, :, :-2] + 4 * c[:, :, 1:-1] + c[:, :, 2:]) / 6
+
+    def wobble(self):
+        r"""Find by how much the center of light moves about the star with its place in the pixel.
+
+        Returns
+        -------
+        float
+            Root mean square over all places, along one axis, in px.
+
+        Notes
+        -----
+        With :math:`\psi_x` the profile summed along the other axis, that is :math:`\sqrt 2\,
+        |\int u\, \psi_x(u)\, e^{-2 \pi i u} du|`: what light there is at one cycle per pixel.
+        """
+        samples = self.samples().mean(axis=0)
+        step = (np.arange(len(samples)) - self._center) / self.oversampling
+        wave = step * np.exp(-2j * np.pi * step) / samples.sum()
+        return float(
+            np.sqrt(np.mean([np.abs(wave @ samples.sum(axis=k)) ** 2 for k in (0, 1)]) * 2)
+        )
 
     @cached_property
     def _components(self):
@@ -283,32 +310,28 @@ def moffat_samples(shape, half, oversampling):
     return samples / samples.sum() * oversampling**2
 
 
-def cutouts(image, xc, yc, half):
-    """Cut-outs (N, n) of 2 half + 1 px squares about integer centers, and where they are inside.
+def shift_matrix(size, shift):
+    """Make the matrix from spline coefficients to values on a grid that is moved.
 
     Parameters
     ----------
-    image : (ny, nx) ndarray
-        Image.
-    xc, yc : (N,) int ndarray
-        Central pixels.
-    half : int
-        Half-width of the squares.
+    size : int
+        Number of coefficients.
+    shift : float
+        Grid steps by which the grid is moved.
 
     Returns
     -------
-    pixels : (N, n) ndarray
-        Values; at the rim those of the outermost pixels are repeated.
-    inside : (N, n) bool ndarray
-        True where the pixel is on the image.
+    (size, size) ndarray
+        Matrix.
     """
-    ny, nx = image.shape
-    step = np.arange(-half, half + 1)
-    iy, ix = yc[:, None] + step, xc[:, None] + step
-    inside = ((iy >= 0) & (iy < ny))[:, :, None] & ((ix >= 0) & (ix < nx))[:, None, :]
-    iy, ix = np.clip(iy, 0, ny - 1), np.clip(ix, 0, nx - 1)
-    flat = (len(xc), len(step) ** 2)
-    return image[iy[:, :, None], ix[:, None, :]].reshape(flat), inside.reshape(flat)
+    base, taps, _ = spline_taps(np.arange(size) + shift)
+    column = base[:, None] + np.arange(-1, 3)
+    inside = (column >= 0) & (column < size)
+    matrix = np.zeros((size, size))
+    row = np.broadcast_to(np.arange(size)[:, None], column.shape)
+    matrix[row[inside], column[inside]] = taps[inside]
+    return matrix
 
 
 def _hat(position, nodes):

@@ -23,6 +23,8 @@ _FAIR_MISMATCH = 0.03
 _FINEST = 1.4
 # Share of broad stars that is not chance.
 _BROAD_SHARE = 0.04
+# Chi square of left-out stars, relative, from which a PSF is better than one with less freedom.
+_BETTER = 0.99
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
 
@@ -76,7 +78,7 @@ def learn_psf(field, stars, fwhm, gain, vary):
     n = len(stars.x)
     if n < MIN_STARS:
         return None
-    log.info("effective PSF from %d stars, own error %.3f", n, noise.mismatch)
+    log.debug("effective PSF from %d stars, own error %.3f", n, noise.mismatch)
     degree = int(np.searchsorted(_STARS_FOR_DEGREE, n))
     if vary == "never" or degree == 0:
         return profile
@@ -84,15 +86,21 @@ def learn_psf(field, stars, fwhm, gain, vary):
     left_out = np.arange(n) % 5 == 2
     options["iterations"] = 2
     trial = {"radius": wide, "degree": degree}
-    varying = vary_profile(field, noise, stars.take(~left_out), profile, fwhm, **trial)
+    kinds = [trial | {"lean": lean} for lean in (False, True)]
+    tried = [profile] + [
+        vary_profile(field, noise, stars.take(~left_out), profile, fwhm, **kind) for kind in kinds
+    ]
     chi2 = [
         np.median(fit_stars(field, p, noise, stars.take(left_out), radius=radius).chi2)
-        for p in (profile, varying)
+        for p in tried
     ]
-    log.info("chi2 of left-out stars: constant PSF %.3f, varying %.3f", *chi2)
-    if not chi2[1] < 0.99 * chi2[0]:
+    log.debug("chi2 of left-out stars: constant PSF %.3f, varying blur %.3f, and lean %.3f", *chi2)
+    # More freedom only where it brings something.
+    best = 1 if chi2[1] < _BETTER * chi2[0] else 0
+    best = 2 if chi2[2] < _BETTER * chi2[best] else best
+    if best == 0:
         return profile
-    varying = vary_profile(field, noise, stars, profile, fwhm, **trial)
+    varying = vary_profile(field, noise, stars, profile, fwhm, **kinds[best - 1])
     varying, stars, noise = learn_profile(field, noise, stars, varying, **options)
-    log.info("own error of the varying PSF %.3f", noise.mismatch)
+    log.debug("own error of the varying PSF %.3f", noise.mismatch)
     return varying if len(stars.x) >= MIN_STARS else profile

@@ -8,6 +8,7 @@ from wpdc_gwcs.cli import (  # noqa: F401
     evaluate,
     export,
     files,
+    monitor,
     report,
     reproduce,
     show,

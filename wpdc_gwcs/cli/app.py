@@ -5,6 +5,7 @@ usage or unreadable input; 130 interrupted, 143 told to end.  Every failure is o
 error that says what, which rule and which value.
 """
 
+import gc
 import logging
 import os
 import signal
@@ -17,13 +18,14 @@ from typing import Annotated
 
 import typer
 
+from wpdc_gwcs.cli.hints import hint_of
 from wpdc_gwcs.exceptions import FrameFailure, InputError, WPDCError, WPDCWarning
 
 __all__ = ["app", "main", "set_verbosity"]
 
 app = typer.Typer(
     name="wpdc",
-    help="Calibrate wide-field frames: image + Gaia in, trustworthy WCS with distortion out.",
+    help="Calibrate the WCS and the distortion of wide-field frames with a catalog such as Gaia.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -94,7 +96,9 @@ def set_verbosity(verbose, quiet):
 
 
 def _fail(message, status):
-    print("wpdc: error: " + " ".join(str(message).split()), file=sys.stderr)
+    text = " ".join(str(message).split())
+    hint = hint_of(text)
+    print(f"wpdc: error: {text}" + (f"; try {hint}" if hint else ""), file=sys.stderr)
     return status
 
 
@@ -201,4 +205,7 @@ def main():
             sys.stdout.flush()
             sys.stderr.flush()
         os._exit(status)
+    # The system takes back what is left of a run: to look through it for cycles takes an eighth of
+    # the time of a small frame.
+    gc.freeze()
     sys.exit(status)

@@ -7,9 +7,12 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.hints import hint_of_frame
+from wpdc_gwcs.cli.inputs import expand_paths
 from wpdc_gwcs.cli.options import (
     Blind,
     Cache,
@@ -39,9 +42,12 @@ from wpdc_gwcs.cli.options import (
 )
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.cli.report import write_page
-from wpdc_gwcs.exceptions import FrameFailure, InputError, InternalError
+from wpdc_gwcs.exceptions import InputError, InternalError
 
 log = logging.getLogger("wpdc_gwcs.cli")
+
+# More frames than this are not told one by one.
+_MOST_LINES = 100
 
 Catalog = Annotated[
     str,
@@ -49,7 +55,7 @@ Catalog = Annotated[
         "--catalog",
         metavar="CAT",
         help="Reference catalog: FITS_LDAC, or any table astropy reads (Gaia column names); "
-        "'gaia' asks the archive, 'hats:PATH' reads a partitioned catalog.",
+        "'gaia' queries the archive, 'hats:PATH' reads a partitioned catalog.",
     ),
 ]
 WcsFile = Annotated[
@@ -68,7 +74,8 @@ def calibrate_command(
         list[str],
         typer.Argument(
             metavar="FRAME",
-            help="FITS images (path or path[EXT]), FITS_LDAC lists, or source tables with --wcs.",
+            help="FITS images (path or path[EXT]), FITS_LDAC lists, or source tables with --wcs; "
+            "folders of them, patterns in quotes, @LIST for a file with one in each line.",
         ),
     ],
     catalog: Catalog,
@@ -88,75 +95,75 @@ def calibrate_command(
         str | None,
         typer.Option(
             metavar="KEYWORD",
-            help="Header keyword that is the same for the detectors of one exposure; default: "
-            "EXPNUM, OBSID and the like, else the time it began.",
+            help="Header keyword that is the same for all detectors of one exposure; default: "
+            "EXPNUM, OBSID and similar keywords, else the start time.",
         ),
     ] = None,
     no_camera: Annotated[
         bool,
-        typer.Option("--no-camera", help="Detectors of one exposure know nothing of each other."),
+        typer.Option("--no-camera", help="Treat the detectors of one exposure separately."),
     ] = False,
     solution: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="FILE",
-            help="Stored *.solution.asdf (once for each detector) or *.camera.asdf: keep the "
-            "distortion; each frame gets its attitude, and a field where its stars speak for one.",
+            help="Stored *.solution.asdf (once for each detector) or *.camera.asdf: keep its "
+            "distortion; fit the attitude of each frame, and a field if there is evidence.",
         ),
     ] = None,
     update: Annotated[
         bool,
         typer.Option(
             "--update",
-            help="Merge the frames into the stored solution, which follows a change that they "
-            "show.",
+            help="Merge the frames into the stored solution, and adapt it if the detector has "
+            "changed.",
         ),
     ] = False,
     refine: Annotated[
         str,
         typer.Option(
             metavar="{auto,attitude,field,pv}",
-            help="What an exposure has of its own: six linear numbers (attitude), also a smooth "
-            "field where its evidence is there (auto) or always (field), or a polynomial (pv).",
+            help="Fit for each exposure: six linear numbers (attitude), also a smooth field if "
+            "there is evidence (auto) or always (field), or a polynomial (pv).",
         ),
     ] = "auto",
     free_stars: Annotated[
         bool,
         typer.Option(
             "--free-stars",
-            help="Places of reference stars in several exposures are unknowns, within the "
-            "catalog's errors: for catalogs worse than the camera.",
+            help="Fit the positions of reference stars that are in several exposures, for catalogs "
+            "that are less accurate than the camera.",
         ),
     ] = False,
     method: Annotated[
         str,
         typer.Option(
             metavar="{wpdc,paper}",
-            help="One solution of all exposures (wpdc), or the literal WPDC-2P to compare with "
-            "(paper): a polynomial of each exposure, raw residuals in a bilinear table.",
+            help="One solution of all exposures (wpdc), or WPDC-2P exactly as published (paper): "
+            "a polynomial per exposure, raw residuals in a bilinear table.",
         ),
     ] = "wpdc",
     degree: Annotated[
         str,
         typer.Option(
             metavar="{auto,1...7}",
-            help="Degree of the polynomial; auto: by evidence, delivered as a cubic and a table.",
+            help="Degree of the polynomial; auto: by evidence, stored as a cubic and a table.",
         ),
     ] = "auto",
     lut: Annotated[
         str,
         typer.Option(
             metavar="{auto,none}",
-            help="Look-up table of what the polynomial leaves (auto), or the polynomial alone "
-            "(none).",
+            help="Look-up table for the residuals of the polynomial (auto), or the polynomial "
+            "alone (none).",
         ),
     ] = "auto",
     weight: Annotated[
         str,
         typer.Option(
             metavar="NAME",
-            help="Radial weight of the polynomial, the table has the rest: exp-sqrt, gaussian, "
-            "inverse, inverse-square (the paper's w1 to w4) or uniform.",
+            help="Radial weight of the polynomial; the table contains the rest: exp-sqrt, "
+            "gaussian, inverse, inverse-square (w1 to w4 of the paper) or uniform.",
         ),
     ] = "exp-sqrt",
     r0: Annotated[
@@ -197,7 +204,7 @@ def calibrate_command(
         float,
         typer.Option(
             metavar="SHARE",
-            help="Share of the reference stars kept out of every fit and measured separately.",
+            help="Share of the reference stars kept out of every fit and evaluated separately.",
         ),
     ] = 0.0,
     seed: Annotated[
@@ -223,7 +230,7 @@ def calibrate_command(
         bool,
         typer.Option(
             "--resume",
-            help="Leave out what a run of the same inputs, options and version has done already.",
+            help="Skip frames that a run with the same options and version has already done.",
         ),
     ] = False,
     report: Annotated[
@@ -239,9 +246,9 @@ def calibrate_command(
 
     Writes STEM.wcs.asdf and STEM.matches.ecsv for each solved frame (and STEM.sources.ecsv for
     images), DETECTOR.solution.asdf for each detector, CAMERA.camera.asdf for detectors that were
-    solved together, and summary.ecsv.  A frame that lacks something is delivered as degraded, and
-    the summary says what.  Exit status 1 if a frame was not solved: it has no WCS file, and its row
-    of the summary says why.
+    solved together, and summary.ecsv.  A frame whose WCS has a limitation is degraded, and the
+    summary names the limitation.  The exit status is 1 if a frame was not solved: it has no WCS
+    file, and its row of the summary says why.
     """
     from wpdc_gwcs.calibration import calibrate
     from wpdc_gwcs.calibration.cluster import cluster_executor
@@ -290,7 +297,9 @@ def calibrate_command(
     keys = {"exposure_keyword": exposure_key, "camera": not no_camera}
     keys |= by_hand(epoch, pixel_scale, origin)
     keys |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
-    loaded = read_files(frames, wcs=wcs, detector=detector, **keys)
+    maps = [path for path in (catalog, mask, weight_map) if path is not None]
+    paths = expand_paths(frames, without=maps)
+    loaded = read_files(paths, wcs=wcs, detector=detector, **keys)
     page = output / "report.html"
     if report:
         require_free(page, overwrite or resume)
@@ -308,11 +317,11 @@ def calibrate_command(
             output=output,
             overwrite=overwrite,
             resume=resume,
+            keep=False,
             progress=progress,
         )
     if report:
-        tables = {c.frame: c.matches for c in run.calibrations}
-        write_page(run.summary, run.solutions, tables, page, overwrite=overwrite or resume)
+        write_page(output, page, overwrite=overwrite or resume)
     if not quiet:
         if resume:
             typer.echo(
@@ -323,18 +332,20 @@ def calibrate_command(
         if update:
             print_changes(run)
     state_first_pixel(loaded)
-    for calibration in run.calibrations:
-        if calibration.statistics["reasons"]:
-            log.warning(
-                "%s: degraded: %s", calibration.frame, "; ".join(calibration.statistics["reasons"])
-            )
-    for name, error in run.failures.items():
+    degraded = [row for row in run.summary if row["status"] == "degraded"]
+    for row in degraded[:_MOST_LINES]:
+        log.warning("%s: degraded: %s", row["frame"], row["reason"])
+    for name, error in list(run.failures.items())[:_MOST_LINES]:
         details = f" (details in {output / ERRORS})" if isinstance(error, InternalError) else ""
         log.error("%s: not solved: %s%s", name, error, details)
-    refused = [f.source for f in loaded if isinstance(run.failures.get(f.name), FrameFailure)]
-    if refused and not quiet:
-        given = f"{shlex.quote(refused[0])} --catalog {shlex.quote(catalog)}"
-        typer.echo(f"stage by stage, and what to try: wpdc explain {given} --output why.png")
+    for what, found in (("degraded", degraded), ("not solved", run.failures)):
+        if len(found) > _MOST_LINES:
+            log.warning(
+                "%d more frames are %s: see the column 'reason' of %s",
+                len(found) - _MOST_LINES, what, output / "summary.ecsv",
+            )  # fmt: skip
+    if not quiet:
+        tell_hints(run.failures, {f.name: f.source for f in loaded}, catalog=catalog, wcs=wcs)
     if any(isinstance(error, InputError) for error in run.failures.values()):
         raise typer.Exit(2)
     if run.failures:
@@ -379,6 +390,28 @@ def stored_solutions(paths):
     return single if len(paths) == 1 and single is not None else found
 
 
+def tell_hints(failures, sources, **given):
+    """Print what to try with the frames that failed, once for each kind of reason.
+
+    Parameters
+    ----------
+    failures : dict
+        Frame name to error.
+    sources : dict
+        Frame name to its path.
+    **given
+        As for `hint_of_frame`.
+    """
+    told = set()
+    for name, error in failures.items():
+        hint = hint_of_frame(error, sources[name], **given)
+        # Hints of one kind differ by the frame alone.
+        kind = None if hint is None else hint.replace(shlex.quote(sources[name]), "")
+        if kind is not None and kind not in told:
+            told.add(kind)
+            typer.echo(f"try: {hint}")
+
+
 def print_changes(run):
     """Print what an update has changed.
 
@@ -418,18 +451,22 @@ def print_summary(run, folder):
     folder : Path
         Where the results are.
     """
-    width = max([len("frame"), *(len(name) for name in run.summary["frame"])])
+    shown = run.summary
+    if len(shown) > _MOST_LINES:
+        typer.echo(f"{len(shown)} frames, see {folder / 'summary.ecsv'}; the last {_MOST_LINES}:")
+        shown = shown[-_MOST_LINES:]
+    width = max([len("frame"), *(len(name) for name in shown["frame"])])
     typer.echo(
         f"{'frame':<{width}}  status    sources  matched  sigma_dx  sigma_dy  rms_mas  seconds"
     )
-    for row in run.summary:
+    for row in shown:
         typer.echo(
             f"{row['frame']:<{width}}  {row['status']:<8}  {row['n_sources']:7d}  "
             f"{row['n_matched']:7d}  "
             f"{float(row['sigma_dx'].value):8.4f}  {float(row['sigma_dy'].value):8.4f}  "
             f"{float(row['rms_mas'].value):7.2f}  {float(row['seconds'].value):7.2f}"
         )
-    n = len(run.calibrations)
-    degraded = sum(row["status"] == "degraded" for row in run.summary)
+    n = int(np.sum(run.summary["status"] != "failed"))
+    degraded = int(np.sum(run.summary["status"] == "degraded"))
     also = f", {degraded} of them degraded" if degraded else ""
     typer.echo(f"{n} of {len(run.summary)} frames solved{also}; results in {os.fspath(folder)}")

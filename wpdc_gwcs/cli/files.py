@@ -1,4 +1,4 @@
-"""Commands on results: `pix2sky`, `sky2pix`, `monitor`."""
+"""Commands on results: `pix2sky`, `sky2pix`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +7,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
-from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose
+from wpdc_gwcs.cli.options import Overwrite
 from wpdc_gwcs.exceptions import InputError
 
 CalibrationFile = Annotated[
@@ -60,7 +60,7 @@ def pix2sky_command(
     output: Output = None,
     overwrite: Overwrite = False,
 ):
-    """Pixel to sky: prints RA and Dec (ICRS, deg); a table gets the columns ra and dec."""
+    """Convert pixels to RA and Dec (ICRS, deg); a table gets the columns ra and dec."""
     _transform(file, points, origin, output, overwrite, forward=True)
 
 
@@ -77,7 +77,7 @@ def sky2pix_command(
     output: Output = None,
     overwrite: Overwrite = False,
 ):
-    """Sky to pixel: prints x and y; a table gets the columns x and y.  Off the detector: nan."""
+    """Convert RA and Dec to pixels; a table gets the columns x and y.  Off the detector: nan."""
     _transform(file, points, origin, output, overwrite, forward=False)
 
 
@@ -164,62 +164,3 @@ def match_files(paths):
             raise InputError(f"{path}: no such file")
         found.append(path)
     return found
-
-
-@app.command("monitor", no_args_is_help=True)
-def monitor_command(
-    solution: Annotated[
-        Path, typer.Argument(metavar="SOLUTION", help="The stored *.solution.asdf file.")
-    ],
-    paths: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="MATCHES...",
-            help="Results of frames calibrated with it: *.matches.ecsv, *.wcs.asdf or folders.",
-        ),
-    ],
-    false_alarm: Annotated[
-        float,
-        typer.Option(metavar="P", help="Accepted probability of an alarm without a change."),
-    ] = 0.01,
-    output: Output = None,
-    overwrite: Overwrite = False,
-    verbose: Verbose = 0,
-    quiet: Quiet = False,
-):
-    """Is a stored solution still right?  Exit status 1 if the residuals say that it is not.
-
-    The frames must have been calibrated with it: wpdc calibrate --solution SOLUTION --refine
-    attitude.
-    """
-    from wpdc_gwcs.evaluation import detect_drift
-    from wpdc_gwcs.io import read, read_matches, write_table
-    from wpdc_gwcs.solution import DistortionSolution
-
-    stored = read(solution)
-    if not isinstance(stored, DistortionSolution):
-        raise InputError(f"{solution}: monitor needs a *.solution.asdf file")
-    tables = [read_matches(path) for path in match_files(paths)]
-    try:
-        drift = detect_drift(stored, tables, false_alarm=false_alarm)
-    except ValueError as err:
-        raise InputError(str(err)) from err
-    if output is not None:
-        write_table(drift.cells, output, overwrite=overwrite)
-    if not quiet:
-        verdict = "has drifted" if drift.drifted else "no drift found"
-        typer.echo(
-            f"{stored.detector}: {verdict} (p = {drift.p_value:.2g}, {drift.n_stars} stars in "
-            f"{len(tables)} frames)"
-        )
-        if drift.drifted:
-            typer.echo(f"  by {drift.amplitude:.4f} px rms in {drift.area:.0%} of the detector")
-        for cell in drift.cells[drift.cells["changed"]][:5]:
-            typer.echo(
-                f"  x {cell['x_min'].value:.0f} to {cell['x_max'].value:.0f}, "
-                f"y {cell['y_min'].value:.0f} to {cell['y_max'].value:.0f}: "
-                f"dx {cell['dx'].value:+.4f} +- {cell['sigma_dx'].value:.4f}, "
-                f"dy {cell['dy'].value:+.4f} +- {cell['sigma_dy'].value:.4f} px"
-            )
-    if drift.drifted:
-        raise typer.Exit(1)

@@ -1,5 +1,6 @@
 """`wpdc report`: one page about a run."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -22,59 +23,74 @@ def report_command(
 ):
     """Write one self-contained HTML page about a result folder.
 
-    Detectors come first, pooled over their frames, then the frames, folded, and the settings.
+    The page has the detectors, pooled over their frames, then each frame, and the settings.
     """
-    from wpdc_gwcs.io import read, read_matches, read_table
-
     require_plotting("the report")
     output = folder / "report.html" if output is None else output
     require_free(output, overwrite)
-    summary = read_table(folder / "summary.ecsv")
-    for column in ("frame", "detector", "status"):
-        if column not in summary.colnames:
-            raise FileFormatError(f"{folder / 'summary.ecsv'}: must have a column {column!r}")
-    tables = {
-        name: read_matches(folder / f"{name}.matches.ecsv")
-        for name in summary["frame"][summary["status"] != "failed"]
-    }
-    found = [read(path) for path in sorted(folder.glob("*.solution.asdf"))]
-    # What an update has superseded lies beside what is valid now.
-    found.sort(key=lambda solution: solution.valid_to is None)
-    write_page(
-        summary, {s.detector: s for s in found}, tables, output, overwrite=overwrite, folder=folder
-    )
+    n_frames = write_page(folder, output, overwrite=overwrite)
     if not quiet:
-        typer.echo(f"{output}: report of {len(summary)} frames")
+        typer.echo(f"{output}: report of {n_frames} frames")
 
 
-def write_page(summary, solutions, matches, path, *, overwrite, folder=None):
-    """Write the report, whole or not at all.
+class _Matches(Mapping):
+    """Match tables of the frames of a folder, each read whenever it is asked for."""
+
+    def __init__(self, folder, names):
+        self._folder, self._names = folder, dict.fromkeys(map(str, names))
+
+    def __getitem__(self, name):
+        from wpdc_gwcs.io import read_matches
+
+        if name not in self._names:
+            raise KeyError(name)
+        return read_matches(self._folder / f"{name}.matches.ecsv")
+
+    def __contains__(self, name):
+        return name in self._names
+
+    def __iter__(self):
+        return iter(self._names)
+
+    def __len__(self):
+        return len(self._names)
+
+
+def write_page(folder, path, *, overwrite):
+    """Write the report of a result folder, whole or not at all.
 
     Parameters
     ----------
-    summary : `~astropy.table.Table`
-        One row per frame.
-    solutions : dict
-        Detector name to solution.
-    matches : dict
-        Frame name to match table.
+    folder : Path
+        Result folder.
     path : Path
         File to write.
     overwrite : bool
         Whether it may be replaced.
-    folder : Path, optional
-        Result folder, if it is not that of the page.
+
+    Returns
+    -------
+    int
+        Number of frames.
     """
-    from wpdc_gwcs.io import atomic_path
+    from wpdc_gwcs.io import atomic_path, read, read_table
     from wpdc_gwcs.report import write_report
 
-    about = about_run(path.parent if folder is None else folder)
-
+    summary = read_table(folder / "summary.ecsv")
+    for column in ("frame", "detector", "status"):
+        if column not in summary.colnames:
+            raise FileFormatError(f"{folder / 'summary.ecsv'}: must have a column {column!r}")
+    matches = _Matches(folder, summary["frame"][summary["status"] != "failed"])
+    found = [read(path) for path in sorted(folder.glob("*.solution.asdf"))]
+    # What an update has superseded lies beside what is valid now.
+    found.sort(key=lambda solution: solution.valid_to is None)
+    solutions = {s.detector: s for s in found}
     with (
         atomic_path(path, overwrite=overwrite) as temporary,
         temporary.open("w", encoding="utf-8") as file,
     ):
-        write_report(summary, solutions, matches, file, about=about)
+        write_report(summary, solutions, matches, file, about=about_run(folder))
+    return len(summary)
 
 
 def about_run(folder):

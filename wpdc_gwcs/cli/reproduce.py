@@ -30,15 +30,17 @@ def reproduce_command(
     ] = False,
     jobs: Annotated[int, typer.Option(metavar="N", help="Processes that match frames.")] = 1,
     # SEED of the reproduction, which is imported when it is needed.
-    seed: Annotated[int, typer.Option(metavar="N", help="Another seed, another camera.")] = 9193,
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Another seed gives another camera.")
+    ] = 9193,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
     """Make the tables and figures of the paper, with the literal method and the default one.
 
-    Writes a folder for each part, and results.ecsv: what the paper says, what its method gives to
-    the letter, and what the default gives.
+    Writes a folder for each part, and results.ecsv with the numbers of the paper, of its exact
+    method, and of the default method.
     """
     from wpdc_gwcs.reproduction import FULL, PARTS, QUICK, reproduce
 

@@ -3,7 +3,8 @@
 import numpy as np
 import sep
 
-from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, cutouts, mode, sizes, window
+from wpdc_gwcs.cutouts import cut_squares
+from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, mode, sizes, window
 from wpdc_gwcs.detection._strips import high_pixels
 
 __all__ = ["extract_peaks", "is_broad", "search", "star_size", "typical_fwhm"]
@@ -22,6 +23,14 @@ _BROAD = 4.5
 _STRIP = 1024
 _OVERLAP = 64
 _PIXELS = 7_000_000
+
+# Pixels that sep has room for beyond those of sources; and the share of pixels that noise alone
+# lifts above the threshold before it is smoothed: they need room only where noise is correlated,
+# and that much there is.
+_ROOM = 300_000
+_BY_CHANCE = 0.03
+# Of so many rows one tells how many pixels sources have.
+_SAMPLED = 4
 
 # Sources that tell the size of the stars.
 _N_BRIGHT = 500
@@ -85,9 +94,10 @@ def search(background, threshold, deblend_contrast, fwhm=0.0):
         start = max(first - overlap, 0)
         strip = background.rows(start, min(last + overlap, n_rows))
         # Room for all pixels of all sources; no more, because sep writes to all of it every time.
-        high = high_pixels(strip.image, strip.rms, threshold)
-        active = sum(np.count_nonzero(part) for _, part in high)
-        sep.set_extract_pixstack(min(300_000 + 3 * active, 300_000 + strip.image.size))
+        high = high_pixels(strip.image[::_SAMPLED], strip.rms[::_SAMPLED], threshold)
+        active = _SAMPLED * sum(np.count_nonzero(part) for _, part in high)
+        active -= int(_BY_CHANCE * strip.image.size)
+        sep.set_extract_pixstack(min(_ROOM + 3 * max(active, 0), _ROOM + strip.image.size))
         found = sep.extract(
             strip.image,
             threshold,
@@ -173,7 +183,7 @@ def star_size(image, x, y):
     for _ in range(4):
         sigma = fwhm * SIGMA_PER_FWHM
         half = int(np.ceil(3 * sigma)) + 1
-        pixels = cutouts(image, xc, yc, half)
+        pixels = cut_squares(image, xc, yc, half)
         major, minor = sizes(pixels, *window(x, y, xc, yc, half, sigma), sigma)
         size = np.hypot(major, minor) / np.sqrt(2)
         known = np.isfinite(size) & (size > 0)

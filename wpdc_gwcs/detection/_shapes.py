@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from wpdc_gwcs.cutouts import cut_squares
 from wpdc_gwcs.flags import FLAG_BAD_PIXEL, FLAG_EDGE, FLAG_SATURATED
 
 __all__ = [
     "SIGMA_PER_FWHM",
-    "cutouts",
     "daofind_shape",
     "measure_shapes",
     "mode",
@@ -15,29 +15,6 @@ __all__ = [
 ]
 
 SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
-
-
-def cutouts(image, xc, yc, half):
-    """Cut squares about integer centers; clamped at the edge of the image.
-
-    Parameters
-    ----------
-    image : (ny, nx) ndarray
-        Image.
-    xc, yc : (N,) ndarray of int
-        Central pixels.
-    half : int
-        The squares are 2 half + 1 px wide.
-
-    Returns
-    -------
-    (N, n, n) ndarray
-        Pixels.
-    """
-    step = np.arange(-half, half + 1)
-    iy = np.clip(yc[:, None] + step, 0, image.shape[0] - 1)
-    ix = np.clip(xc[:, None] + step, 0, image.shape[1] - 1)
-    return image[iy[:, :, None], ix[:, None, :]]
 
 
 def window(x, y, xc, yc, half, sigma):
@@ -129,7 +106,7 @@ def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, full):
     sigma = fwhm * SIGMA_PER_FWHM
     half = int(np.ceil(3 * sigma)) + 1
     xc, yc = np.rint(x).astype(int), np.rint(y).astype(int)
-    pixels = cutouts(image, xc, yc, half)
+    pixels = cut_squares(image, xc, yc, half)
     dx, dy, weight = window(x, y, xc, yc, half, sigma)
     # Clamped cut-outs repeat the outermost pixels: they must not count twice.
     step = np.arange(-half, half + 1)
@@ -143,17 +120,17 @@ def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, full):
         0,
     )
     if bad is not None:
-        masked = cutouts(bad, xc, yc, half)
+        masked = cut_squares(bad, xc, yc, half)
         weight *= ~masked
         flags |= np.where((masked & core).any((1, 2)), FLAG_BAD_PIXEL, 0)
     if full is not None:
-        full = cutouts(full, xc, yc, half)
+        full = cut_squares(full, xc, yc, half)
         flags |= np.where((full & core).any((1, 2)), FLAG_SATURATED, 0)
-    variance = cutouts(background.rms, xc, yc, half).astype(float) ** 2
+    variance = cut_squares(background.rms, xc, yc, half).astype(float) ** 2
     if gain is not None:
         photons = np.maximum(pixels, 0) / gain
         if background.photons is not None:
-            photons *= cutouts(background.photons, xc, yc, half)
+            photons *= cut_squares(background.photons, xc, yc, half)
         variance += photons
     signal = (weight * pixels).sum((1, 2))
     noise = weight**2 * variance
@@ -199,7 +176,7 @@ def daofind_shape(image, xpeak, ypeak, sigma):
         Roundness is NaN where a marginal has no height.
     """
     half = max(2, int(1.5 * sigma))
-    pixels = cutouts(image, xpeak, ypeak, half).astype(float)
+    pixels = cut_squares(image, xpeak, ypeak, half).astype(float)
     step = np.arange(-half, half + 1)
     gauss = np.exp(-0.5 * (step / sigma) ** 2)
     triangle = half + 1.0 - np.abs(step)

@@ -1,7 +1,13 @@
-"""Residuals of frames, detectors and runs; radial weights side by side; drift; the truth."""
+"""Residuals of frames, detectors and runs; comparison of radial weights; drift; the truth."""
 
 from wpdc_gwcs.evaluation.cuts import Cuts
 from wpdc_gwcs.evaluation.drift import Drift, detect_drift
+from wpdc_gwcs.evaluation.history import (
+    DriftHistory,
+    residuals_of_attitude,
+    split_periods,
+    track_drift,
+)
 from wpdc_gwcs.evaluation.pooled import (
     DetectorResiduals,
     format_table,
@@ -24,6 +30,7 @@ __all__ = [
     "Cuts",
     "DetectorResiduals",
     "Drift",
+    "DriftHistory",
     "ResidualStatistics",
     "TruthScore",
     "WeightResult",
@@ -35,11 +42,14 @@ __all__ = [
     "format_table",
     "pool_residuals",
     "pool_scores",
+    "residuals_of_attitude",
     "robust_scatter",
     "running_statistics",
     "score_frame",
+    "split_periods",
     "tabulate_detectors",
     "tabulate_scores",
     "tabulate_weights",
+    "track_drift",
     "uncorrected_residuals",
 ]

@@ -1,4 +1,4 @@
-"""The WCS of any file as a calibration: read as it is where that can be, fitted otherwise.
+"""The WCS of any file as a calibration: read as it is if possible, otherwise fitted.
 
 ::
 
@@ -18,6 +18,7 @@ import numpy as np
 from wpdc_gwcs.conversion import fit_wcs
 from wpdc_gwcs.exceptions import FileFormatError, InputError
 from wpdc_gwcs.io.asdf import read_asdf
+from wpdc_gwcs.io.extensions import load_extensions
 from wpdc_gwcs.io.files import (
     READ_ERRORS,
     file_kind,
@@ -111,6 +112,7 @@ def _fit(wcs, path, image_shape):
 
 
 def _read_tree(file, name):
+    load_extensions()
     with warnings.catch_warnings():
         # Tags of packages that are not installed: what they stand for is not asked for.
         warnings.simplefilter("ignore")

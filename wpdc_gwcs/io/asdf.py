@@ -43,6 +43,7 @@ from astropy.modeling import CompoundModel
 from wpdc_gwcs.camera import Camera
 from wpdc_gwcs.exceptions import FileFormatError, InputError
 from wpdc_gwcs.export import FORMAT_VERSION
+from wpdc_gwcs.io.extensions import load_extensions
 from wpdc_gwcs.io.files import READ_ERRORS, as_utf8, atomic_path, first_line
 from wpdc_gwcs.io.integrity import check_size, check_version, content_sum
 from wpdc_gwcs.lookup import ResidualMap
@@ -298,7 +299,7 @@ def write_tree(tree, path, overwrite, compression=None):
         Of the arrays, as asdf names it.
     """
     # A context copies what is loaded: extensions are to be looked for once, not for every file.
-    unchecked = _unchecked(tuple(asdf.get_config().extensions))
+    unchecked = _unchecked(load_extensions())
     with (
         atomic_path(path, overwrite=overwrite) as temporary,
         asdf.config_context() as config,
@@ -335,6 +336,7 @@ def read_entry(path, key, *, whole=False):
     FileFormatError
         If the file is missing, damaged or cut short.
     """
+    load_extensions()
     try:
         # Absolute, since a leading '~' is not a name to asdf, even if the file is open.
         with open(Path(path).absolute(), "rb") as stream, warnings.catch_warnings():

@@ -13,7 +13,7 @@ from astropy.wcs.utils import wcs_to_celestial_frame
 from wpdc_gwcs.exceptions import FileFormatError, WPDCWarning
 from wpdc_gwcs.io.files import READ_ERRORS, first_line
 from wpdc_gwcs.io.headers import header_shape, header_text, header_value
-from wpdc_gwcs.io.tan import PV_CARD, idle_pv, parse_tan
+from wpdc_gwcs.io.tan import PV_CARD, idle_pv, parse_tan, require_place
 
 __all__ = ["parse_wcs"]
 
@@ -178,6 +178,9 @@ def _parse_other(header, hdus, name, error):
         wcs.wcs.ctype, wcs.wcs.crval = ctype, crval
         wcs.wcs.set_pv(pv)
         wcs.wcs.set()
+    if not wcs.wcs.tab:
+        # Of a table, CRVAL is a row.
+        require_place(*wcs.wcs.crval, name, error)
     shape = header_shape(header)
     if shape is not None:
         wcs.array_shape = shape

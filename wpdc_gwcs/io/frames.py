@@ -28,8 +28,7 @@ from wpdc_gwcs.io.companions import (
     map_beside,
     pair_companions,
 )
-from wpdc_gwcs.io.dates import EXPOSURE_KEYS, header_epoch, header_start
-from wpdc_gwcs.io.exposures import camera_key, exposure_key, has_identifier
+from wpdc_gwcs.io.dates import header_epoch
 from wpdc_gwcs.io.files import (
     READ_ERRORS,
     file_kind,
@@ -44,8 +43,17 @@ from wpdc_gwcs.io.headers import (
     find_extension,
     header_shape,
     header_text,
-    positive_number,
     read_headers,
+)
+from wpdc_gwcs.io.identity import (
+    NOT_NAMES,
+    detector_name,
+    distinct,
+    exposure_keys,
+    file_name,
+    header_facts,
+    of_one_exposure,
+    on_its_own,
 )
 from wpdc_gwcs.io.images import (
     choose_plane,
@@ -67,24 +75,8 @@ from wpdc_gwcs.io.sources import (
 
 __all__ = ["read_frames"]
 
-_DETECTOR_KEYS = (
-    "DETECTOR",
-    "DETNAME",
-    "CCDNAME",
-    "CHIPNAME",
-    "EXTNAME",
-    "CHIPID",
-    "CCDNUM",
-    "CCDCHIP",
-    "CCDID",
-    "IMAGEID",
-)
-_FACTS = {"filter": ("FILTER", "FILTER1", "BAND"), "object": ("OBJECT",), "date": ("DATE-OBS",)}
-# Camera of frames that are tied to others and do not name theirs.
-_CAMERA = "camera"
 # Companions that tell the noise of the sky, best first.
 _WEIGHTS = ("weight", "error", "variance")
-_NOT_NAMES = ("PRIMARY", "COMPRESSED_IMAGE", "")
 
 
 def read_frames(
@@ -114,17 +106,16 @@ def read_frames(
         with the number of a plane of a cube (from zero; ``L``: the sum of all), FITS_LDAC source
         list (one frame for each of its detectors), or a table of sources, which needs ``wcs``.
     wcs : path-like or `~astropy.io.fits.Header`, optional
-        Header to use instead of the frame's own: FITS file, ``path[EXT]``, ``.head`` or other text
-        file; of several headers, one for each frame.
+        Header to use instead of that of the frame: FITS file, ``path[EXT]``, ``.head`` or other
+        text file; several headers are used for one frame each.
     detector : str, optional
         Name of the detector instead of the header's.
     name : str, optional
         Name of the frame instead of the file's.
     image_shape : (int, int), optional
-        Shape ``(ny, nx)`` of the detector, where a source list or table does not tell.
+        Shape ``(ny, nx)`` of the detector, if it is not in a source list or table.
     exposure_keyword : str, optional
-        Keyword of the header whose value tells exposures apart, instead of those that are looked
-        for.
+        Header keyword that distinguishes exposures, instead of the usual ones.
     camera : bool, optional
         Whether frames belong to a camera and an exposure; `False` leaves each on its own.
     epoch : float, optional
@@ -132,17 +123,17 @@ def read_frames(
     pixel_scale : float, optional
         Scale in arcsec / px, instead of the headers'.
     origin : {0, 1}, optional
-        Number of the first pixel in tables of sources, instead of what they tell.
+        Number of the first pixel in tables of sources, instead of that found in the table.
     mask, weight_map : path-like, optional
-        FITS image, ``path`` or ``path[EXT]``, of the pixels that must not be used, and of inverse
-        variances, in place of those in the file; of several images, those with the names or the
-        numbers of the frames' extensions.
+        FITS images, ``path`` or ``path[EXT]``, of bad pixels and of inverse variances, instead of
+        those in the file.  If a file has several images, those with the names or the numbers of
+        the extensions of the frames are used.
     mask_bits : int, optional
-        Sum of the bits of masks that are bad.  By default those that the header names, or all but
-        those whose pixels are like the rest, or that mark sources.
+        Sum of the bits that mean bad pixels in masks.  By default those that the header names, or
+        all except those that mark sources or whose pixels look like the others.
     beside : sequence of path-like, optional
-        Files with masks and weights that came with this one: they are used as those in the file
-        itself, where ``mask`` and ``weight_map`` give none.
+        Files with masks and weights that belong to this one.  They are used like those in the file
+        itself unless ``mask`` or ``weight_map`` is given.
 
     Returns
     -------
@@ -158,22 +149,22 @@ def read_frames(
     Warns
     -----
     WPDCWarning
-        If a date makes no sense, a reference system is not known, or a shape has to be guessed.
+        If a date is invalid, a reference system is unknown, or a shape has to be guessed.
 
     Notes
     -----
-    A frame is called like its file without endings; of several frames in a file, each has the name
-    or the number of its extension appended.  The detector is that of ``DETECTOR``, ``DETNAME``,
-    ``CCDNAME``, ``EXTNAME``, ... in this order; frames of one file are never one detector.
+    The name of a frame is that of its file without endings.  If a file has several frames, the name
+    or the number of the extension is appended.  The detector comes from ``DETECTOR``, ``DETNAME``,
+    ``CCDNAME``, ``EXTNAME``, ... in this order; frames of one file are never the same detector.
 
-    Extensions with masks, weights, errors, times and the like are no frames, but are used with the
-    image that they belong to (SCI, ERR, DQ and their relatives).  A mosaic of pixels behind
-    different filters, and an image of three planes that its header calls colors, are measured on
-    the sum of their light; of other cubes a plane has to be chosen.
+    Extensions with masks, weights, errors or times are not frames; they are used with the image to
+    which they belong (SCI, ERR, DQ and similar names).  A mosaic of pixels behind different
+    filters, and an image with three planes that its header describes as colors, are measured on
+    the sum of their light.  For other cubes, a plane must be chosen.
 
-    The camera is ``INSTRUME``, else ``TELESCOP``.  Frames of one camera are of one exposure if
-    ``EXPNUM``, ``OBSID`` or the like is the same or, where there is none, the time at which they
-    began; the frames of one file are so in any case, unless such an identifier differs.
+    The camera comes from ``INSTRUME``, else from ``TELESCOP``.  Frames of one camera belong to one
+    exposure if ``EXPNUM``, ``OBSID`` or a similar keyword is the same or, if there is none, the
+    start time.  Frames of one file always do, unless such a keyword differs.
     """
     if origin not in (None, 0, 1):
         raise ValueError(f"origin must be 0 or 1, got {origin!r}")
@@ -197,7 +188,7 @@ def read_frames(
             origin=origin,
         )
         frame = replace(frame, **by_hand)
-        return [frame if camera else _on_its_own(frame)]
+        return [frame if camera else on_its_own(frame)]
     headers = None if wcs is None else _given_headers(wcs)
     with open_fits(path, error=FrameError) as hdus:
         chosen, companions = _choose(hdus, path, extension)
@@ -234,12 +225,12 @@ def read_frames(
         part["mask_bits"] = mask_bits
         label = "_".join([part["label"]] * several + part["chosen"])
         frames.append(_frame_of(part, path, stem, label, detector, image_shape, exposure_keyword))
-    frames = [replace(f, **by_hand) for f in _distinct(frames, prepared)]
+    frames = [replace(f, **by_hand) for f in distinct(frames, prepared)]
     if not camera:
-        return [_on_its_own(f) for f in frames]
+        return [on_its_own(f) for f in frames]
     if not several or exposure_keyword is not None:
         return frames
-    return _of_one_exposure(frames, prepared, path)
+    return of_one_exposure(frames, prepared, path)
 
 
 def _given_headers(wcs):
@@ -343,7 +334,7 @@ def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
         elif "CTYPE1" not in header:
             raise FrameError(f"{where}: header must have a celestial WCS, has no CTYPE1")
     label = header_text(header, "EXTNAME")
-    if label.upper() in _NOT_NAMES or label == "LDAC_OBJECTS":
+    if label.upper() in NOT_NAMES or label == "LDAC_OBJECTS":
         label = str(index)
     elif hdu.is_image and hdu.ver > 1:
         label += f"_{hdu.ver}"
@@ -412,8 +403,8 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
     if shape is None:
         shape = _guess_shape(loaders["load_sources"](), where)
     return Frame(
-        name=f"{stem}_{_file_name(label)}" if label else stem,
-        detector=str(detector) if detector is not None else _detector_of(headers),
+        name=f"{stem}_{file_name(label)}" if label else stem,
+        detector=str(detector) if detector is not None else detector_name(headers),
         image_shape=tuple(int(n) for n in shape),
         wcs=part["wcs"],
         epoch=header_epoch(headers, name=where),
@@ -421,8 +412,8 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
         gain=image_gain(headers),
         read_noise=image_read_noise(headers),
         saturation=image_saturation(headers),
-        **_keys_of(headers, exposure_keyword, where, part["chosen"]),
-        meta=_facts(headers) | _choices(part, str(path)),
+        **exposure_keys(headers, exposure_keyword, where, part["chosen"]),
+        meta=header_facts(headers) | _choices(part, str(path)),
         inputs=tuple(dict.fromkeys(c.path for c in part["companions"] if c.path != str(path))),
         **loaders,
     )
@@ -458,86 +449,9 @@ def _image_loaders(part, path):
     return loaders
 
 
-def _keys_of(headers, exposure_keyword, where, chosen=()):
-    """Find camera and exposure; a frame that does not tell its camera is on its own."""
-    exposure = exposure_key(headers, keyword=exposure_keyword, name=where)
-    if exposure is not None and chosen:
-        # Planes of a cube are of one detector, and so of different exposures.
-        exposure = "_".join([exposure, *chosen])
-    camera = camera_key(headers)
-    if camera is None and exposure_keyword is not None:
-        camera = _CAMERA
-    return {"camera": camera, "exposure": None if camera is None else exposure}
-
-
-def _on_its_own(frame):
-    return replace(frame, camera=None, exposure=None)
-
-
-def _of_one_exposure(frames, parts, path):
-    """Tie the frames of a file, unless identifiers say that they are different exposures.
-
-    Their times need not be the same: each detector may have written its own.
-    """
-    frames = [replace(f, camera=f.camera or _CAMERA) for f in frames]
-    if len({f.exposure for f in frames}) == 1 and frames[0].exposure is not None:
-        return frames
-    if all(has_identifier(p["headers"]) for p in parts):
-        return frames
-    return [replace(f, exposure=str(path)) for f in frames]
-
-
-def _detector_of(headers):
-    # The primary header describes the whole camera: it has no say where the frame's own names one.
-    for header in headers:
-        for key in _DETECTOR_KEYS:
-            text = header_text(header, key)
-            if text.upper() not in (*_NOT_NAMES, "LDAC_OBJECTS", "LDAC_IMHEAD"):
-                return text
-    return "detector"
-
-
 def _first_pixel(origin):
     """State the number of the first pixel of a table of sources."""
     return {"first_pixel": "0, since nothing tells" if origin is None else str(origin)}
-
-
-def _facts(headers):
-    facts = {}
-    for fact, keys in _FACTS.items():
-        text = next((t for h in headers for k in keys if (t := header_text(h, k))), "")
-        if text:
-            facts[fact] = text
-    numbers = {
-        "exptime": positive_number(headers, EXPOSURE_KEYS),
-        "start": header_start(headers),
-    }
-    return facts | {fact: n for fact, n in numbers.items() if n is not None}
-
-
-def _distinct(frames, parts):
-    """Make names of frames and detectors of one file differ."""
-    if len(frames) < 2:
-        return frames
-    if len({f.name for f in frames}) < len(frames):
-        frames = [
-            replace(f, name=f"{f.name}_{p['index']}") for f, p in zip(frames, parts, strict=True)
-        ]
-    if len({f.detector for f in frames}) < len(frames):
-        frames = [
-            replace(f, detector=f"{f.detector}_{p['label']}")
-            for f, p in zip(frames, parts, strict=True)
-        ]
-    if len({f.detector for f in frames}) < len(frames):
-        frames = [
-            replace(f, detector=f"{f.detector}_{p['index']}")
-            for f, p in zip(frames, parts, strict=True)
-        ]
-    return frames
-
-
-def _file_name(text):
-    return re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_") or "image"
 
 
 def _read_text_table(
@@ -568,14 +482,14 @@ def _read_text_table(
         epoch = header_epoch([meta, header], name=str(path))
     return Frame(
         name=stem,
-        detector=str(detector) if detector is not None else _detector_of([meta, header]),
+        detector=str(detector) if detector is not None else detector_name([meta, header]),
         image_shape=tuple(int(n) for n in shape),
         wcs=parse_wcs(header, name=str(wcs), error=FrameError, pixel_scale=pixel_scale),
         epoch=epoch,
         source=str(path),
         load_sources=sources.copy,
-        **_keys_of([meta, header], exposure_keyword, str(path)),
-        meta=_facts([meta, header]) | _first_pixel(origin),
+        **exposure_keys([meta, header], exposure_keyword, str(path)),
+        meta=header_facts([meta, header]) | _first_pixel(origin),
     )
 
 

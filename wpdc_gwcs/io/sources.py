@@ -48,6 +48,7 @@ _FAMILIES = (
     ("x_coordinate", "y_coordinate", 1),
     ("base_sdsscentroid_x", "base_sdsscentroid_y", 0),
     ("slot_centroid_x", "slot_centroid_y", 0),
+    ("field_x", "field_y", 1),
     ("xcenter", "ycenter", None),
     ("x_center", "y_center", None),
     ("xcen", "ycen", None),

@@ -19,7 +19,7 @@ from wpdc_gwcs.models import PVPolynomial, pv_terms
 from wpdc_gwcs.models.attitude import fold_attitude
 from wpdc_gwcs.solution import FARTHEST_PX
 
-__all__ = ["PV_CARD", "TanHeader", "idle_pv", "parse_tan"]
+__all__ = ["PV_CARD", "TanHeader", "idle_pv", "parse_tan", "require_place"]
 
 #: Keywords of projection parameters: axis and index.
 PV_CARD = re.compile(r"PV([12])_(\d+)")
@@ -31,6 +31,8 @@ _LATITUDES = ("DEC", "GLAT", "ELAT")
 # Highest PV index of each degree, the radial term of odd degrees included.
 _LAST_INDEX = {1: 3, 2: 6, 3: 11, 4: 16, 5: 23, 6: 30, 7: 39}
 _RADIAL = (3, 11, 23, 39)
+# Longitudes of some programs run on after a turn; of those further off nothing but noise is left.
+_FARTHEST_LONGITUDE = 720.0  # deg
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,8 +161,7 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
     if not spread > 0 or abs(np.linalg.det(cd)) < 1e-10 * spread**2:
         rows = ", ".join(f"{v:.6g}" for v in cd.ravel())
         raise error(f"{name}: CD matrix must not be singular, got [{rows}]")
-    if not -90.0 <= crval[1] <= 90.0:
-        raise error(f"{name}: declination CRVAL must lie in [-90, 90] deg, got {crval[1]:g}")
+    require_place(*crval, name, error)
     pv = _read_pv(numbers if is_tpv else set(), order, number, name, error)
     shape = header_shape(header)
     _require_area(pv, cd, crpix, shape, name, error)
@@ -172,6 +173,32 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
         turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
         cd, pv = turn @ cd, fold_attitude(pv, turn)
     return TanHeader(crpix, cd, crval, pv, shape)
+
+
+def require_place(longitude, latitude, name, error):
+    """Refuse a reference point that is no place on a sphere.
+
+    Parameters
+    ----------
+    longitude, latitude : float
+        ``CRVAL``, deg.
+    name : str
+        What messages call the header.
+    error : type
+        Class of the error.
+
+    Raises
+    ------
+    InputError
+        If the longitude is more than two turns off or the latitude is beyond the poles.
+    """
+    if not abs(longitude) <= _FARTHEST_LONGITUDE:
+        raise error(
+            f"{name}: longitude CRVAL must lie within {_FARTHEST_LONGITUDE:g} deg, "
+            f"got {longitude:g}"
+        )
+    if not abs(latitude) <= 90.0:
+        raise error(f"{name}: latitude CRVAL must lie in [-90, 90] deg, got {latitude:g}")
 
 
 def _require_area(pv, cd, crpix, shape, name, error):

@@ -257,7 +257,12 @@ def header_error(problem, match):
         if value > most:
             return MatchError(
                 f"the {what} of the starting WCS is off by {value:.4g} {unit}, "
-                f"{most:.4g} {unit} are allowed; {_HINT}"
+                f"{most:.4g} {unit} are allowed; {_HINT}",
+                found={
+                    "shift": tuple(map(float, shift)),
+                    "rotation": float(turned[1]),
+                    "scale": float(scaled[1]),
+                },
             )
     return None
 

@@ -1,9 +1,10 @@
 """Figures of residuals, distortion, look-up tables and weights.
 
-Two kinds of functions, both made without ``pyplot``: nothing is shown, kept or switched behind the
-caller's back.  The figures of one frame return a new `matplotlib.figure.Figure`;
-``figure.savefig(path)`` writes it.  Those of the paper, of a detector or a whole camera, draw into
-the ``axes`` that they are given, or into new ones, and return them; ``axes.figure`` is the figure.
+There are two kinds of functions.  Neither uses ``pyplot``, so nothing is shown and no global state
+changes.  Functions for one frame return a new `matplotlib.figure.Figure`, which
+``figure.savefig(path)`` writes.  Functions for a detector or a whole camera, like the figures of
+the paper, draw into the given ``axes`` or into new ones, and return them; ``axes.figure`` is the
+figure.
 
 =============================  =====================================================================
 of a frame                     shows
@@ -19,18 +20,21 @@ of a frame                     shows
 =============================  =====================================================================
 of a detector or a camera      shows
 =============================  =====================================================================
-`plot_focal_plane`             the distortion of all detectors where they stand
+`plot_focal_plane`             the distortion of all detectors in the focal plane
 `plot_before_after`            residuals before and after the calibration, with their profiles
 `plot_slices`                  mean residuals in slices of the detector, several solutions together
 `plot_weights`                 distributions with each of the radial weights
 `plot_magnitude`               residuals against magnitude, pooled
 `plot_centroids`               centroid errors against magnitude, and the photon limit
 `plot_sky_offsets`             offsets on the sky with histograms and Gaussian fits
+`plot_drift_history`           residuals and drift of a detector over time
+`plot_cell_history`            the same, cell by cell
 =============================  =====================================================================
 """
 
 from wpdc_gwcs.plotting.before_after import plot_before_after
 from wpdc_gwcs.plotting.focal_plane import plot_focal_plane
+from wpdc_gwcs.plotting.history import plot_cell_history, plot_drift_history
 from wpdc_gwcs.plotting.magnitudes import (
     plot_centroids,
     plot_magnitude,
@@ -49,8 +53,10 @@ from wpdc_gwcs.plotting.weights import plot_weights
 
 __all__ = [
     "plot_before_after",
+    "plot_cell_history",
     "plot_cdf",
     "plot_centroids",
+    "plot_drift_history",
     "plot_focal_plane",
     "plot_lookup_table",
     "plot_magnitude",

@@ -39,8 +39,17 @@ _STATISTICS = {
     "d80_dx": ("d80 dx", "px"),
     "d80_dy": ("d80 dy", "px"),
 }
+# Headings of the table of detectors.
+_DETECTOR = (
+    ("detector", None), ("frames", None), ("solved", None), ("degraded", None), ("failed", None),
+    *(_STATISTICS[n] for n in list(_STATISTICS)[:5]),
+    ("held out dx", "sigma, px"), ("held out dy", "sigma, px"), ("rms", "mas"),
+)  # fmt: skip
 # Detectors with all their figures; of more, each has the most important one.
 _FEW_DETECTORS = 6
+# Frames of a detector that are pooled, frames with figures, and rows of a table: of more, which no
+# page can hold, those that are worth a look.
+_MOST_POOLED, _MOST_FIGURES, _MOST_ROWS = 100, 100, 500
 # Characters of a column before its texts are broken.
 _WIDEST = 34
 _POOLED = ("x", "y", "dx", "dy", "used", "holdout", "phot_g_mean_mag", "snr")
@@ -56,52 +65,62 @@ def write_report(summary, solutions, matches, file, *, title="Calibration report
         ``status``.
     solutions : dict
         Detector name to `DistortionSolution`.  Frames of other detectors have no map.
-    matches : dict
+    matches : mapping
         Frame name to match table (``x``, ``y``, ``dx``, ``dy``, ``used``, ``holdout``), of the
-        frames that were solved, whatever they lack.
+        frames that were solved or degraded.  Tables are requested when they are needed and not
+        kept, so they can be read then.
     file : text file object
         Where the page goes.
     title : str, optional
         Heading of the page.
     about : dict, optional
-        What the run was, heading to names and values, such as ``{"settings": {"degree": "auto"}}``;
-        the settings of the solutions if not given.
+        Description of the run, headings to names and values, such as
+        ``{"settings": {"degree": "auto"}}``; the settings of the solutions if not given.
 
     Notes
     -----
-    Everything is in the one page: it can be mailed, and opened without a network.  Frames are
-    folded; 72 of them make less than 3 MB, of one detector or of 72.
+    The page contains everything, so it can be sent by mail and opened without a network.  The
+    sections of the frames are collapsed.  72 frames need less than 3 MB, for one detector or for
+    72.  For a survey, 100 frames of each detector, chosen evenly, are pooled.  The tables have the
+    500 frames that failed, are degraded or have the largest residuals, and the worst 100 of them
+    have figures.
     """
     from jinja2 import Environment
 
     frames = {str(row["frame"]): str(row["detector"]) for row in summary}
-    pooled = {
-        name: _pool([matches[f] for f, d in frames.items() if d == name and f in matches])
-        for name in dict.fromkeys([*frames.values(), *solutions])
-    }
+    names = dict.fromkeys([*frames.values(), *solutions])
     alone = Counter(frames.get(name) for name in matches)
-    ids = {f: f"frame-{k}" for k, f in enumerate(frames) if f in matches}
-    many = len(pooled) > _FEW_DETECTORS
-    sections = [
-        {
-            "id": f"detector-{k}",
-            "title": f"Detector {name}",
-            "text": _describe(solutions.get(name), table),
-            "figures": detector_figures(name, solutions.get(name), table, small=many),
-        }
-        for k, (name, table) in enumerate(pooled.items())
-        if name in solutions or table is not None
-    ]
+    shown = _worst_first(summary, _MOST_ROWS)
+    worst = dict.fromkeys(str(name) for name in shown["frame"])
+    ids = [f for f in (frames if len(shown) == len(summary) else worst) if f in matches]
+    ids = {f: f"frame-{k}" for k, f in enumerate(ids[:_MOST_FIGURES])}
+    sections, rows = [], []
+    for k, name in enumerate(names):
+        mine = [f for f, d in frames.items() if d == name and f in matches]
+        chosen = _evenly(mine, _MOST_POOLED)
+        table = _pool([matches[f] for f in chosen])
+        link = None
+        if name in solutions or table is not None:
+            link = f"detector-{k}"
+            text = _describe(solutions.get(name), table)
+            if len(chosen) < len(mine):
+                text += f"  Pooled are {len(chosen)} of its {len(mine)} frames, evenly chosen."
+            small = len(names) > _FEW_DETECTORS
+            figures = detector_figures(name, solutions.get(name), table, small=small)
+            title = f"Detector {name}"
+            sections.append({"id": link, "title": title, "text": text, "figures": figures})
+        rows.append(_detector_row(summary, name, table, link))
     page = Environment(autoescape=True).from_string(PAGE)
     file.write(
         page.render(
             title=title,
             counts=_counts(summary),
             contents=_contents(sections, ids, about or solutions),
-            detectors=_detector_table(summary, pooled, sections),
+            detectors=_without_empty({"columns": _columns(_DETECTOR, _TEXTS), "rows": rows}),
             sections=sections,
-            summary=_summary_table(summary, ids),
-            everything=_every_column(summary),
+            left_out=len(summary) - len(shown),
+            summary=_summary_table(shown, ids),
+            everything=_every_column(shown),
             frames=[
                 {
                     "id": ids[name],
@@ -117,6 +136,29 @@ def write_report(summary, solutions, matches, file, *, title="Calibration report
             settings=_settings(solutions, about),
         )
     )
+
+
+def _evenly(names, most):
+    """Take some of many, the first and the last among them."""
+    if len(names) <= most:
+        return names
+    return [names[k] for k in np.linspace(0, len(names) - 1, most).round().astype(int)]
+
+
+def _worst_first(summary, most):
+    """Rows of a summary as they are; of too many, failed and degraded ones and large residuals."""
+    if len(summary) <= most:
+        return summary
+    rank = {"failed": 0, "degraded": 1}
+    status = np.array([rank.get(str(s), 2) for s in summary["status"]])
+    size = np.zeros(len(summary))
+    if "rms_mas" in summary.colnames:
+        size = _plain_numbers(summary["rms_mas"])
+    return summary[np.lexsort([-np.nan_to_num(size), status])[:most]]
+
+
+def _plain_numbers(column):
+    return np.ma.filled(np.ma.asarray(getattr(column, "value", column), float), np.nan)
 
 
 def _counts(summary):
@@ -162,35 +204,24 @@ def _columns(pairs, texts=()):
     return [{"name": n, "unit": u, "text": n in texts} for n, u in pairs]
 
 
-def _detector_table(summary, pooled, sections):
-    links = {s["title"].removeprefix("Detector "): s["id"] for s in sections}
-    headings = [
-        ("detector", None), ("frames", None), ("solved", None), ("degraded", None),
-        ("failed", None), *(_STATISTICS[n] for n in list(_STATISTICS)[:5]),
-        ("held out dx", "sigma, px"), ("held out dy", "sigma, px"), ("rms", "mas"),
-    ]  # fmt: skip
-    rows = []
-    for name, table in pooled.items():
-        mine = summary[[str(d) == name for d in summary["detector"]]]
-        states = [str(s) for s in mine["status"]]
-        fit = held = None
-        if table is not None:
-            used, holdout = _masks(table)
-            fit, held = _statistics(table, used), _statistics(table, holdout)
-        cells = [name, len(mine), *(states.count(s) for s in ("solved", "degraded", "failed"))]
-        cells += [getattr(fit, n, np.nan) for n in list(_STATISTICS)[:5]]
-        cells += [getattr(held, n, np.nan) for n in ("sigma_dx", "sigma_dy")]
-        cells.append(_median(mine, "rms_mas"))
-        rows.append(
-            {"cells": [*map(_cell, cells[:-1]), _cell(cells[-1], 2)], "link": links.get(name)}
-        )
-    return _without_empty({"columns": _columns(headings, _TEXTS), "rows": rows})
+def _detector_row(summary, name, table, link):
+    mine = summary[[str(d) == name for d in summary["detector"]]]
+    states = [str(s) for s in mine["status"]]
+    fit = held = None
+    if table is not None:
+        used, holdout = _masks(table)
+        fit, held = _statistics(table, used), _statistics(table, holdout)
+    cells = [name, len(mine), *(states.count(s) for s in ("solved", "degraded", "failed"))]
+    cells += [getattr(fit, n, np.nan) for n in list(_STATISTICS)[:5]]
+    cells += [getattr(held, n, np.nan) for n in ("sigma_dx", "sigma_dy")]
+    cells.append(_median(mine, "rms_mas"))
+    return {"cells": [*map(_cell, cells[:-1]), _cell(cells[-1], 2)], "link": link}
 
 
 def _median(table, name):
     if name not in table.colnames or len(table) == 0:
         return np.nan
-    values = np.ma.filled(np.ma.asarray(getattr(table[name], "value", table[name]), float), np.nan)
+    values = _plain_numbers(table[name])
     return float(np.nanmedian(values)) if np.isfinite(values).any() else np.nan
 
 

@@ -68,7 +68,9 @@ are after 3-sigma clipping.</p>
 <p>{{ section.text }}</p>
 {% for figure in section.figures %}{{ draw(figure) }}{% endfor %}{% endfor %}
 <h2 id="frames">Frames</h2>
-{{ show(summary) }}
+{% if left_out %}<p>These are the frames that failed or are degraded, and those with the largest
+residuals; {{ left_out }} more are in <code>summary.ecsv</code>.</p>
+{% endif %}{{ show(summary) }}
 <details><summary>All columns of the summary</summary>
 {{ show(everything) }}</details>
 {% if frames %}<h2 id="each">Frame by frame</h2>

@@ -1,7 +1,7 @@
 """The solution of a camera: arguments in, frozen results out."""
 
 import logging
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,29 +9,20 @@ from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.fitting import RadialWeight
 from wpdc_gwcs.solve import terms as make
 from wpdc_gwcs.solve.change import find_change
-from wpdc_gwcs.solve.errors import worse_scatter
 from wpdc_gwcs.solve.exposure import SolveResult
 from wpdc_gwcs.solve.fields import with_fields, with_spectra, with_statics
 from wpdc_gwcs.solve.geometry import start_geometry
 from wpdc_gwcs.solve.model import Model
 from wpdc_gwcs.solve.observations import gather
-from wpdc_gwcs.solve.own_polynomial import own_polynomial
-from wpdc_gwcs.solve.represent import (
-    delivered_residual,
-    frame_fit,
-    inherited,
-    represent_detector,
-    represent_frame,
-)
+from wpdc_gwcs.solve.rejection import without_aliens, without_wrong
+from wpdc_gwcs.solve.results import frozen_result
 from wpdc_gwcs.solve.state import (
     State,
-    all_residuals,
     linear_step,
     with_clipping,
     with_error_models,
 )
 from wpdc_gwcs.solve.stored import StoredMap, unswallowed_maps, updated_solution
-from wpdc_gwcs.solve.strength import summarize_fields
 from wpdc_gwcs.solve.tables import choose_tables, folds, residual_maps, with_tables
 
 __all__ = ["solve"]
@@ -52,16 +43,6 @@ _ROUNDS_ALIGN = 6
 _ROUNDS_FIELD = 2
 # Before their waves are known, the errors of the stars seem larger than they are.
 _ROUNDS_WAVES = 2
-
-# Scatter that no distortion model leaves of right pairs, px.
-_MAX_SCATTER = 2.0
-
-# An exposure whose scatter is this many times that of the others has wrong pairs.
-_REJECT_RATIO = 4.0
-
-# Before anything is solved, distortion scatters residuals, but no more than so many times that of
-# the others, and px; frames of fewer pairs than a linear map has terms tell nothing.
-_ALIEN_RATIO, _ALIEN_SCATTER, _LINEAR_TERMS = 10.0, 50.0, 6
 
 # How much larger residuals may be in one part of the detector than elsewhere before they are
 # taken for outliers, once the instrument is known.
@@ -104,30 +85,30 @@ def solve(
         Reference point, px, zero based; the center of the detector, or that of ``solution``, if not
         given.
     cd : (2, 2) array_like, optional
-        Nominal matrix CD0 in which the polynomial of a single detector stands, deg / px; the mean
-        of the solved ones if not given.
+        Nominal matrix CD0 used by the polynomial of a single detector, deg / px; the mean of the
+        solved ones if not given.
     weight : RadialWeight or dict, optional
-        Radial weight of the delivered polynomial; ``exp-sqrt`` with 0.87 times half the shorter
-        side if not given, and uniform with ``lut="none"``, where no table mends an extrapolation.
+        Radial weight of the stored polynomial; by default ``exp-sqrt`` with 0.87 times half the
+        shorter side, or uniform with ``lut="none"``, where no table corrects an extrapolation.
     degree : int or 'auto', optional
-        Degree of the delivered polynomial, and the largest degree of a detector's own distortion.
-        ``auto``: up to 7 by evidence, delivered as a cubic and a table.
+        Degree of the stored polynomial, and the highest degree of the distortion of a detector.
+        ``auto``: up to 7 by evidence, stored as a cubic and a table.
     n_grid : int, optional
         Nodes of the look-up table along each axis.
     lut : {'auto', 'always', 'none'}, optional
-        Whether residuals are smoothed into a table; ``auto`` asks the data.  ``none`` delivers the
-        polynomial alone.
+        Whether residuals are smoothed into a table; ``auto`` decides from the data.  ``none`` gives
+        the polynomial alone.
     refine : {'auto', 'attitude', 'field', 'pv'}, optional
-        What an exposure has of its own: six linear numbers (``attitude``), also a smooth field
-        where its evidence is there (``auto``) or in any case (``field``), or a polynomial of its
-        own (``pv``, the paper's way).
+        What is fitted for each exposure: six linear numbers (``attitude``), also a smooth field if
+        there is evidence for it (``auto``) or always (``field``), or a polynomial (``pv``, as in
+        the paper).
     solution : DistortionSolution or dict, optional
         Stored instrument, or one for each detector by its name.
     update : bool, optional
-        Add the residuals of these exposures to those of ``solution`` and make its table anew.
+        Add the residuals of these exposures to those of ``solution`` and make a new table.
     pool_attitudes : bool, optional
-        Let five or more exposures tell how much scale, rotation and skew really vary between them,
-        and draw each exposure's towards their mean accordingly.
+        Estimate from five or more exposures how much scale, rotation and skew vary between them,
+        and draw those of each exposure toward their mean accordingly.
     clip : float, optional
         Pairs with residuals of more than this many robust standard deviations are left out.
     table_choice : dict, optional
@@ -151,16 +132,16 @@ def solve(
     Notes
     -----
     The residual of a pair is a sum of linear terms (`wpdc_gwcs.solve.terms`), each with a Gaussian
-    prior whose variance is learnt:
+    prior whose variance is learned:
 
     .. math:: r = \Phi(x) w + O(\varphi) o + B(\varphi) a_e + \delta_e(\varphi) + noise
 
-    1. All terms but the fields are solved at once, with the variance of every degree; outliers are
-       judged by what the other stars predict.
-    2. What is left on the detector, pooled over exposures, becomes its table.
-    3. Each exposure gets the field that its evidence speaks for; the shared terms are solved again
-       with the fields marginalized, tables and fields once more.
-    4. The whole is written down as PV polynomial, table, attitude, and a table of the exposure.
+    1. All terms except the fields are solved together, with the variance of every degree.
+       Outliers are judged by the prediction from the other stars.
+    2. The remaining residuals of each detector, pooled over exposures, become its table.
+    3. Each exposure gets a field if there is evidence for it.  The shared terms are solved again
+       with the fields marginalized, and then tables and fields once more.
+    4. The result is stored as PV polynomial, table, attitude, and a table of the exposure.
 
     References
     ----------
@@ -250,7 +231,7 @@ def solve(
     state = linear_step(o, state, learn=1, pool=pool_attitudes)
     if any(state.spectra.values()):
         state = with_fields(o, state)
-    return _result(o, state, stored, infos, group, {
+    return frozen_result(o, state, stored, infos, group, {
         "weight": weights, "degree": degree, "pv_degree": pv_degree, "n_grid": n_grid,
         "lut": lut, "refine": refine, "clip": float(clip), "pool_attitudes": bool(pool_attitudes),
     }, cd, update)  # fmt: skip
@@ -348,87 +329,16 @@ def _start(o, degree, stored):
 
 def _align(o, state, clip, pool):
     """Solve all terms, outliers and errors together, from the start of the frames."""
-    state = _without_aliens(o, state)
+    state = without_aliens(o, state)
     for turn in range(_ROUNDS_ALIGN):
         state = linear_step(o, state, learn=_LEARN, pool=pool)
         # Distortion that is not yet in the model is not noise: clip little at first.
         state = with_clipping(o, state, clip, relax=max(1.0, 4.0 / 2**turn))
         if turn and not o.has_errors.all():
             state = with_error_models(o, state)
-    state = _without_wrong(o, state)
+    state = without_wrong(o, state)
     state = linear_step(o, state, learn=_LEARN, pool=pool)
     return with_error_models(o, state)
-
-
-def _without_aliens(o, state):
-    """Leave out frames whose pairs no linear map brings near those of the others.
-
-    One of them would draw the polynomial of all towards itself.
-    """
-    residual = all_residuals(o, state)
-    reasons, scatter = list(state.reason), {}
-    for f in state.active:
-        s = o.slices[f]
-        r = residual[:, s][:, o.valid[s]]
-        seen = np.isfinite(r).all(0)
-        if not seen.size:
-            reasons[f] = "none of its pairs can be used"
-        elif not seen.mean() > 0.5:
-            reasons[f] = "its stars are not where it points: wrong pairs"
-        elif seen.sum() > _LINEAR_TERMS:
-            x, y = o.x[s][o.valid[s]][seen], o.y[s][o.valid[s]][seen]
-            rows = np.stack([np.ones_like(x), x, y], axis=1)
-            left = r[:, seen].T - rows @ np.linalg.lstsq(rows, r[:, seen].T, rcond=None)[0]
-            scatter[f] = worse_scatter(left.T)
-    typical = np.median(list(scatter.values())) if scatter else 0.0
-    for f, value in scatter.items():
-        if len(scatter) > 2 and value > max(_ALIEN_RATIO * typical, _ALIEN_SCATTER):
-            reasons[f] = (
-                f"its residuals scatter by {value:.3g} px, those of the others by "
-                f"{typical:.3g} px: wrong pairs"
-            )
-    return _left_out(o, state, reasons)
-
-
-def _without_wrong(o, state):
-    """Leave out frames whose pairs scatter as only wrong ones do."""
-    residual = all_residuals(o, state)
-    scatter = {}
-    for f in state.active:
-        valid = o.valid[o.slices[f]]
-        if valid.any():
-            scatter[f] = worse_scatter(residual[:, o.slices[f]][:, valid])
-    reasons = list(state.reason)
-    typical = np.median(list(scatter.values()))
-    for f in state.active:
-        if f not in scatter:
-            reasons[f] = "none of its pairs can be used"
-        elif scatter[f] > _MAX_SCATTER:
-            reasons[f] = f"its residuals scatter by {scatter[f]:.3g} px: wrong pairs"
-        elif len(scatter) > 2 and scatter[f] > max(_REJECT_RATIO * typical, 0.1):
-            reasons[f] = (
-                f"its residuals scatter by {scatter[f]:.3g} px, those of the others by "
-                f"{typical:.3g} px: wrong pairs"
-            )
-    return _left_out(o, state, reasons)
-
-
-def _left_out(o, state, reasons):
-    kept = state.kept.copy()
-    for f, reason in enumerate(reasons):
-        if reason is not None and state.reason[f] is None:
-            log.warning("exposure %s left out: %s", o.frames[f].name, reason)
-            kept[o.slices[f]] = False
-    if all(reasons):
-        own = {frame.name: r for frame, r in zip(o.frames, reasons)}
-        listed = "; ".join(f"{name}: {r}" for name, r in own.items())
-        raise FitError(
-            f"exposure {listed}"
-            if len(own) == 1
-            else f"all {len(own)} exposures were left out: {listed}",
-            reasons=own,
-        )
-    return replace(state, kept=kept, reason=tuple(reasons))
 
 
 def _settled(o, state, clip, pool):
@@ -463,112 +373,3 @@ def _updated(o, state, stored, group, n_grid, force):
         # What the fields had taken of a change is the instrument's now.
         state = linear_step(o, with_spectra(o, state, force=force, bends=False), learn=1)
     return state, stored, infos
-
-
-def _result(o, state, stored, infos, group, settings, cd, update):
-    """Frozen results of a solved state."""
-    n_grid, lut, refine, degree = (settings[k] for k in ("n_grid", "lut", "refine", "degree"))
-    pv_degree = settings["pv_degree"]
-    solutions = {}
-    factors = [inherited(o, state, k) for k in range(len(o.detectors))]
-    tables = [
-        _table_sigma(info, stored.get(d.name), factor)
-        for d, info, factor in zip(o.detectors, infos, factors)
-    ]
-    weights = settings.pop("weight")
-    del settings["pv_degree"]
-    for k, detector in enumerate(o.detectors):
-        if not any(o.detector_of[f] == k for f in state.active):
-            continue
-        if detector.name in stored:
-            solution = stored[detector.name]
-            if not update:
-                solutions[detector.name] = solution
-                continue
-        else:
-            solution = represent_detector(
-                o, state, k, weight=weights[detector.name], degree=pv_degree,
-                n_grid=0 if lut == "none" else n_grid, cd=cd,
-                table_sigma=None if infos[k] is None else tables[k], factor=factors[k],
-            )  # fmt: skip
-        weight = weights[detector.name]
-        solutions[detector.name] = replace(
-            solution,
-            statistics={
-                **solution.statistics,
-                **_statistics(o, state, k, infos[k], solution, settings),
-            },
-            settings={**settings, "weight": weight.name, "r0": float(weight.r0)},
-        )
-    residual = all_residuals(o, state)
-    fits, places = [], {}
-    for f in range(len(o.frames)):
-        parts = {}
-        if state.reason[f] is None:
-            solution = solutions[o.detector(f).name]
-            tabled = lut != "none" or refine == "field"
-            parts = represent_frame(
-                o, state, f, solution, n_grid=n_grid if tabled else 0,
-                table_sigma=tables[o.detector_of[f]], factor=factors[o.detector_of[f]],
-                places=places,
-            )  # fmt: skip
-            if not tabled:
-                residual[:, o.slices[f]] = delivered_residual(o, f, solution, parts)
-            if refine == "pv":
-                parts = own_polynomial(o, state, f, solution, parts, residual, weights)
-        fits.append(frame_fit(o, state, f, residual, parts))
-    if not stored:
-        solutions = _with_maps(o, state, group, solutions)
-    rejected = {fit.name: fit.reason for fit in fits if fit.reason is not None}
-    named = {d.name: i for d, i in zip(o.detectors, infos) if i is not None}
-    color = float(o.reference_color) if np.isfinite(o.reference_color) else None
-    return SolveResult(solutions, tuple(fits), rejected, named, color)
-
-
-def _table_sigma(info, stored, factor):
-    """Uncertainty of what stands beside the shared terms: a smoothed table, a stored solution."""
-    if info is not None and info.sigma is not None:
-        return info.sigma * np.array([factor, factor, 1.0])[:, None, None]
-    return None if stored is None or info is not None else stored.table_sigma
-
-
-def _with_maps(o, state, group, solutions):
-    """Solutions with the binned residuals behind them, about their polynomials alone."""
-    tables = [solutions[d.name].lookup_table if d.name in solutions else None for d in o.detectors]
-    maps = residual_maps(o, state, group, tables)
-    return {
-        d.name: replace(solutions[d.name], residual_map=m)
-        for d, m in zip(o.detectors, maps)
-        if d.name in solutions
-    }
-
-
-def _statistics(o, state, k, info, solution, settings):
-    frames = [f for f in state.active if o.detector_of[f] == k]
-    kept = int(sum(state.kept[o.slices[f]].sum() for f in frames))
-    statistics = {"n_exposures": len(frames), "n_used": kept}
-    for name, value in statistics.items():
-        statistics[name] = value + solution.statistics.get(name, 0)
-    # One model for pairs with stated errors, one for pairs without (there the scale is the error
-    # in px); the first of them by itself, too.
-    first = next(iter(state.error_models.values()))
-    statistics |= {
-        "error_scale": first["scale"], "error_floor": first["floor"],
-        "error_models": state.error_models,
-        "learned": solution.statistics.get("learned", {})
-                 | {t.name: [float(v) for v in state.model.sigma[t.name]]
-                    for t in state.model.terms if t.decay or t.chromatic},
-    }  # fmt: skip
-    if settings["lut"] != "none" and settings["refine"] in ("auto", "field"):
-        statistics["fields"] = summarize_fields(
-            [state.spectrum(o, f) for f in frames],
-            solution.image_shape,
-            solution.statistics.get("fields"),
-        )
-    if state.pooled:
-        statistics["attitude_variation"] = state.pooled
-    if info is not None:
-        statistics["table"] = asdict(info.choice)
-        statistics["table_chi2"] = float(info.chi2)
-        statistics["table_candidates"] = [asdict(c) for c in info.candidates]
-    return statistics

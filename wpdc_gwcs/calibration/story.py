@@ -1,0 +1,226 @@
+"""What a run has done, stage by stage, in words: for ``-v`` and ``wpdc explain``."""
+
+from collections import Counter
+
+import numpy as np
+
+from wpdc_gwcs.calibration.matched import FailedFrame
+from wpdc_gwcs.calibration.measure import rules_of
+from wpdc_gwcs.selection import left_out
+
+__all__ = [
+    "tell_catalog",
+    "tell_frames",
+    "tell_match",
+    "tell_outcome",
+    "tell_result",
+    "tell_solution",
+    "tell_sources",
+]
+
+_GAIN = {
+    "given": "as given",
+    "header": "of its header, which its noise bears out",
+    "noise": "by the noise in its stars",
+}
+# What a catalog may have besides positions, and how it is called.
+_COLUMNS = {
+    "pmra": "proper motions",
+    "parallax": "parallaxes",
+    "ra_error": "errors",
+    "phot_g_mean_mag": "magnitudes",
+    "bp_rp": "colors",
+}
+
+
+def tell_frames(frames, groups):
+    """Say what was read.
+
+    Parameters
+    ----------
+    frames : list of Frame
+        All frames.
+    groups : list of list of Frame
+        Those that are solved together.
+
+    Returns
+    -------
+    list of str
+        A line.
+    """
+    images = sum(frame.load_image is not None for frame in frames)
+    kinds = Counter({"image": images, "source list": len(frames) - images})
+    kinds = " and ".join(_many(n, what) for what, n in kinds.items() if n)
+    exposures = {(f.camera, f.exposure or f.name) for f in frames}
+    detectors = {(f.camera, f.detector) for f in frames}
+    return [
+        f"frames: {kinds} of {_many(len(detectors), 'detector')}, "
+        f"{_many(len(exposures), 'exposure')}; solved in {_many(len(groups), 'group')}"
+    ]
+
+
+def tell_catalog(catalog, seconds):
+    """Say what the reference catalog has.
+
+    Parameters
+    ----------
+    catalog : `~astropy.table.Table`
+        As read, or the part of it that is needed.
+    seconds : float
+        How long it took.
+
+    Returns
+    -------
+    list of str
+        A line.
+    """
+    have = [word for name, word in _COLUMNS.items() if name in catalog.colnames]
+    text = f"catalog: {_many(len(catalog), 'star')} with {', '.join(['positions', *have])}"
+    if "ref_epoch" in catalog.colnames and len(catalog):
+        text += f", of {float(np.nanmedian(np.asarray(catalog['ref_epoch'], float))):.1f}"
+    return [f"{text} ({seconds:.1f} s)"]
+
+
+def tell_sources(sources, frame, settings):
+    """Say what was measured on a frame, and what takes part.
+
+    Parameters
+    ----------
+    sources : `~astropy.table.Table`
+        As from `measure_sources`.
+    frame : Frame
+        Its shape counts.
+    settings : Settings
+        What sources are judged by.
+
+    Returns
+    -------
+    list of str
+        Counts, and of an image FWHM and gain.
+    """
+    rules = rules_of(sources, frame, settings)
+    usable = int(np.sum(~np.any(list(rules.values()), axis=0)))
+    lines = [f"{usable} of {len(sources)} sources take part ({left_out(rules)})"]
+    fwhm = sources.meta.get("fwhm")
+    if fwhm is not None and np.isfinite(float(getattr(fwhm, "value", fwhm))):
+        lines.append(f"stars have a FWHM of {float(getattr(fwhm, 'value', fwhm)):.2f} px")
+    gain, origin = sources.meta.get("gain"), sources.meta.get("gain_from")
+    if origin in _GAIN:
+        lines.append(f"gain of {gain:.3g} electrons per count, {_GAIN[origin]}")
+    return lines
+
+
+def tell_match(found):
+    """Say how a frame was matched, and how sure that is.
+
+    Parameters
+    ----------
+    found : MatchDiagnostics
+        Of the match.
+
+    Returns
+    -------
+    list of str
+        Pairs and evidence, what the header was off by, what was left out.
+    """
+    return [
+        f"{found.n_pairs} pairs, {found.expected_by_chance:.1f} expected by chance "
+        f"({found.significance:.0f} sigma), purity {found.purity:.3f}",
+        f"the header is off by {found.shift[0]:.1f}, {found.shift[1]:.1f} px, turned by "
+        f"{found.rotation:.3f} deg, scaled by {found.scale:.5f}"
+        + (", mirrored" if found.parity < 0 else ""),
+        f"{found.n_ambiguous} sources with two candidates left out, pairs scatter by "
+        f"{found.scatter:.2f} px about a smooth mapping",
+    ]
+
+
+def tell_result(frame, result, settings):
+    """Say what became of a frame before it is solved.
+
+    Parameters
+    ----------
+    frame : Frame
+        The frame.
+    result : MatchedFrame or FailedFrame
+        Its match.
+    settings : Settings
+        What sources are judged by.
+
+    Returns
+    -------
+    list of str
+        A line for its sources and one for its match, with the time.
+    """
+    lines = []
+    if result.sources is not None:
+        told = "; ".join(tell_sources(result.sources, frame, settings))
+        lines.append(f"{frame.name}: sources: {told}")
+    if isinstance(result, FailedFrame):
+        text = f"failed: {result.error}"
+    else:
+        text = f"match: {'; '.join(tell_match(result.diagnostics)[:2])}"
+    return [*lines, f"{frame.name}: {text} ({result.seconds:.1f} s)"]
+
+
+def tell_solution(solution):
+    """Say what the solver has chosen for a detector.
+
+    Parameters
+    ----------
+    solution : DistortionSolution
+        Its solution.
+
+    Returns
+    -------
+    str
+        A line.
+    """
+    statistics = solution.statistics
+    text = f"{solution.detector}: polynomial of degree {solution.pv.degree}"
+    table = statistics.get("table") or {}
+    lookup = solution.lookup_table
+    if lookup is None:
+        text += ", no table"
+    else:
+        text += f" and table of {len(lookup.x_grid)} x {len(lookup.y_grid)} nodes"
+    if table.get("kernel") == "none":
+        text += " (residuals speak for no more than the terms of the camera)"
+    elif table.get("kernel"):
+        text += f" ({table['kernel']} of {table['freedom']:.0f} degrees of freedom)"
+    if "n_used" in statistics:
+        text += (
+            f", from {_many(statistics['n_used'], 'pair')} in "
+            f"{_many(statistics['n_exposures'], 'exposure')}"
+        )
+    if "error_scale" in statistics:
+        text += f"; errors of the stars x {statistics['error_scale']:.2f}"
+    return text
+
+
+def tell_outcome(outcome, seconds):
+    """Say what became of frames that were solved together.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        What was found.
+    seconds : float
+        How long it took.
+
+    Returns
+    -------
+    list of str
+        A line for each detector, and one for the frames.
+    """
+    fields = sum(c.field is not None for c in outcome.calibrations)
+    states = Counter(row["status"] for row in outcome.rows)
+    told = ", ".join(f"{states[s]} {s}" for s in ("solved", "degraded", "failed") if states[s])
+    return [
+        *(f"solution: {tell_solution(one)}" for one in outcome.solutions.values()),
+        f"solution: {_many(len(outcome.rows), 'frame')}: {told}; {fields} with a field of their "
+        f"own ({seconds:.1f} s)",
+    ]
+
+
+def _many(n, what):
+    return f"{n} {what}{'s' * (n != 1)}"

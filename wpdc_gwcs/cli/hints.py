@@ -1,0 +1,151 @@
+"""What to try next, for every kind of error: in one place, so that none is forgotten.
+
+A hint is a command, or an option of the one that failed.  Rules are asked in turn; an error whose
+message says already what to do has none.
+"""
+
+import difflib
+import os
+import re
+import shlex
+from pathlib import Path
+
+from wpdc_gwcs.exceptions import InternalError
+
+__all__ = ["hint_of", "hint_of_frame"]
+
+# Messages of errors that end a command, and what to try; "{path}" is what the message begins with.
+_OF_COMMANDS = (
+    (
+        r"(?P<path>.+?): (?:catalog must be an existing file|must be a readable file: No such file"
+        r"|no such file|no such configuration file)",
+        "_similar",
+    ),
+    (r"(?P<path>.+?): catalog must have columns 'ra'", "name its columns ra and dec, in degrees"),
+    (
+        r"(?P<path>.+?): columns .* must have a unit",
+        "wpdc catalog prepare from a copy of it with units",
+    ),
+    (
+        r"(?P<path>.+?): (?:header must have a celestial WCS|a table of sources needs a WCS header"
+        r"|must hold a header with CTYPE1|.*CD matrix must not be singular|card \S+ is missing"
+        r"|.*CTYPE1 and CTYPE2 must)",
+        "--wcs HEADER with the header of another exposure, a .head file or a text file",
+    ),
+    (r"(?P<path>.+?): header must have the scale", "--pixel-scale ARCSEC, or --wcs HEADER"),
+    (r"(?P<path>.+?): shape of the detector must be given", "--wcs HEADER with NAXIS1 and NAXIS2"),
+    (
+        r"(?P<path>.+?): (?:truncated|damaged|must not be empty|.*must agree with its CHECKSUM)",
+        "get the file again, or leave it out",
+    ),
+    (
+        r"(?P<path>.+?): must have an image, FITS_LDAC sources or a table",
+        "wpdc show {path} tells what it is",
+    ),
+    (
+        r"(?P<path>.+?): must have a 'wpdc' tree|(?P<other>.+?): --solution needs",
+        "wpdc show {path} tells what it is",
+    ),
+    (
+        r".*not a manifest of a run|.*must be of the run .* with its tables",
+        "--overwrite to begin anew, or another --output",
+    ),
+    (r".*another solution", "the --solution of that run, or another --output"),
+    (r".*(?:No space left|File too large|Disk quota)", "another --output, on a disk with room"),
+    (r".*would both write", "name them apart, or calibrate them one by one"),
+    (r"exposure .*left out|all \d+ exposures were left out", "wpdc explain FRAME --catalog CAT"),
+)
+# Reasons of frames that failed; the first of each kind has its hint.
+_EXPLAIN = "wpdc explain {frame} --catalog {catalog}{wcs} --output why.png"
+_OF_FRAMES = (
+    (r".*the catalog has no star within", "wpdc catalog prepare gaia --around {frame} --output "
+     "gaia.fits"),
+    (r".*too few reference stars", "a deeper catalog: wpdc catalog prepare gaia --around {frame} "
+     "--output gaia.fits"),
+    (r".*of (?:different|another) shapes?|.*the frame has shape", "frames of this shape by "
+     "themselves, without --solution"),
+    (r".*the frame is of detector", "--detector NAME where the header's is wrong, or another "
+     "--solution"),
+    (r".*it cannot be updated", "a run of these frames without --update"),
+    (r".*those of the stored solution by", "these frames without --solution; wpdc monitor tells "
+     "whether it still holds"),
+    (r".*contradicts those of the other detectors", "--no-camera where this header is right"),
+    (r".*stars agree with the solution", "more exposures of this detector in the run, or its "
+     "--solution"),
+    (r".*its process died", "fewer --jobs, so that each has more memory"),
+    (r".*cannot be handed to another process", "--jobs 1"),
+    (r".*must be (?:a|an) .*px|.*is a cube|.*centroids 'given'|.*has no rows", None),
+    (r".*image is flat|.*no finite, unmasked pixel", "wpdc show {frame} --output look.png"),
+    (r".*no source above", "wpdc detect {frame} --threshold 3 --output sources.ecsv"),
+    (r".*signal-to-noise ratio above", "--min-snr 5; if the gain is wrong, --gain"),
+)  # fmt: skip
+
+
+def hint_of(message):
+    """Tell what to try after an error that ends a command.
+
+    Parameters
+    ----------
+    message : str
+        Of the error.
+
+    Returns
+    -------
+    str or None
+        None where the message says it itself.
+    """
+    for pattern, hint in _OF_COMMANDS:
+        found = re.match(pattern, message, re.DOTALL)
+        if found:
+            parts = found.groupdict()
+            path = parts.get("path") or parts.get("other") or ""
+            if hint == "_similar":
+                return _similar(path)
+            return hint.format(path=shlex.quote(path))
+    return None
+
+
+def hint_of_frame(error, source, *, catalog, wcs=None):
+    """Tell what to try with a frame that was not solved.
+
+    Parameters
+    ----------
+    error : WPDCError
+        Why it was not.
+    source : str
+        Where it came from.
+    catalog : str
+        Catalog of the command.
+    wcs : str, optional
+        Header of the command.
+
+    Returns
+    -------
+    str or None
+        None where the reason says it itself.
+    """
+    parts = {
+        "frame": shlex.quote(source),
+        "catalog": shlex.quote(catalog),
+        "wcs": "" if wcs is None else f" --wcs {shlex.quote(wcs)}",
+    }
+    for pattern, hint in _OF_FRAMES:
+        if re.match(pattern, str(error), re.DOTALL):
+            return None if hint is None else hint.format(**parts)
+    if isinstance(error, InternalError):
+        return "the same command with --resume; if it fails again, please report it"
+    if isinstance(error, OSError):
+        return None
+    return hint_of(str(error)) or _EXPLAIN.format(**parts)
+
+
+def _similar(path):
+    """Name a file that may be meant, or what is missing on the way to it."""
+    path = Path(re.sub(r"\[[^\[\]]*\]$", "", path))
+    folder = path.parent
+    if not folder.is_dir():
+        while not folder.is_dir() and folder != folder.parent:
+            missing, folder = folder, folder.parent
+        return f"another folder: there is no {missing}"
+    close = difflib.get_close_matches(path.name, os.listdir(folder), n=1, cutoff=0.75)
+    return f"{shlex.quote(str(folder / close[0]))}, which is there" if close else None

@@ -1,0 +1,187 @@
+"""A detector over time: residuals and drift, period by period, cell by cell.
+
+::
+
+    frames in order of time --periods--> statistics, test for a drift, means in cells --> History
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import QTable, Table
+
+from wpdc_gwcs.evaluation.drift import detect_drift, mean_in_cells
+from wpdc_gwcs.evaluation.residuals import evaluate
+
+__all__ = ["DriftHistory", "residuals_of_attitude", "split_periods", "track_drift"]
+
+# Cells along each side whose means are followed: small enough to tell where, large enough that a
+# night has stars in each.
+_GRID = 4
+_DAYS_PER_YEAR = 365.25
+# Stars that tell the six numbers of an attitude, and something beyond.
+_LEAST_STARS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class DriftHistory:
+    """Residuals and drift of a detector with a stored solution over time.
+
+    Parameters
+    ----------
+    detector : str
+        Name of the detector.
+    image_shape : (int, int)
+        Shape ``(ny, nx)`` in px.
+    periods : `~astropy.table.QTable`
+        One row for each period: ``first_epoch``, ``last_epoch`` (Julian years), ``n_frames``,
+        ``n_stars``, clipped ``mean_dx``, ``sigma_dx``, ``mean_dy``, ``sigma_dy`` (px), and of
+        `detect_drift` ``p_value``, ``drifted``, ``amplitude`` (px) and ``area``; a period of too
+        few stars has no ``p_value``.
+    cells : `~astropy.table.QTable`
+        For each period the means in 4 x 4 cells: ``period`` (row of the other table), ``x_min``,
+        ``x_max``, ``y_min``, ``y_max``, ``n``, ``dx``, ``dy``, ``sigma_dx``, ``sigma_dy`` (px).
+    """
+
+    detector: str
+    image_shape: tuple
+    periods: QTable
+    cells: QTable
+
+    @property
+    def alarms(self):
+        """Rows of the periods in which the solution did not hold."""
+        return self.periods[self.periods["drifted"]]
+
+
+def split_periods(epochs, days):
+    """Group frames by period.
+
+    Parameters
+    ----------
+    epochs : (N,) array_like
+        Julian years.
+    days : float
+        Length of a period, counted from the first epoch.
+
+    Returns
+    -------
+    list of (M,) ndarray of int
+        Indices of the frames of each period that has any, in order of time.
+
+    Raises
+    ------
+    ValueError
+        If an epoch is not finite, or ``days`` not positive.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.evaluation import split_periods
+    >>> [p.tolist() for p in split_periods([2020.5, 2020.0, 2020.001], 30.0)]
+    [[1, 2], [0]]
+    """
+    epochs = np.asarray(epochs, float)
+    if not np.isfinite(epochs).all():
+        raise ValueError("every frame must have an epoch")
+    if not 0 < days < np.inf:
+        raise ValueError(f"days must be positive, got {days}")
+    if not epochs.size:
+        return []
+    # Epochs have a grain of microseconds.
+    number = np.floor((epochs - epochs.min()) * _DAYS_PER_YEAR / days + 1e-9).astype(int)
+    order = np.argsort(epochs, kind="stable")
+    return [order[number[order] == k] for k in np.unique(number)]
+
+
+def residuals_of_attitude(calibration, matches):
+    """Return the residuals that a frame would have without its field.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of the frame.
+    matches : `~astropy.table.Table`
+        Its matches.
+
+    Returns
+    -------
+    `~astropy.table.Table`
+        The same, or a copy with the field added back to ``dx`` and ``dy``, without the linear part
+        that an attitude absorbs, because a field also absorbs a drift.
+    """
+    if calibration.field is None:
+        return matches
+    x, y = (np.asarray(matches[name], float) for name in ("x", "y"))
+    used = np.asarray(matches["used"], bool)
+    found = matches.copy()
+    rows = np.stack([np.ones_like(x), *(2 * c / c.max(initial=1.0) - 1 for c in (x, y))], axis=1)
+    for axis, field in zip("xy", calibration.field(x, y), strict=True):
+        residual = np.asarray(matches[f"d{axis}"], float) + field
+        error = np.asarray(matches[f"{axis}_err"], float)
+        good = used & np.isfinite(residual) & (error > 0)
+        if good.sum() >= _LEAST_STARS:
+            weight = 1.0 / error[good, None]
+            linear = np.linalg.lstsq(rows[good] * weight, residual[good] * weight[:, 0])[0]
+            residual = residual - rows @ linear
+        found[f"d{axis}"] = residual
+        found[f"d{axis}"].unit = matches[f"d{axis}"].unit
+    return found
+
+
+def track_drift(solution, periods, *, false_alarm=0.01):
+    """Follow a stored solution over time.
+
+    Parameters
+    ----------
+    solution : DistortionSolution
+        The stored solution.
+    periods : iterable of (epochs, matches)
+        Epochs of the frames of a period, Julian years or NaN, and their match tables as for
+        `detect_drift`; they are used one by one and not kept.
+    false_alarm : float, optional
+        Accepted probability of an alarm in a period without a change; for many periods, give a
+        share of the total.
+
+    Returns
+    -------
+    DriftHistory
+        A row for each period.
+
+    Raises
+    ------
+    ValueError
+        If there is no period, or ``false_alarm`` is not between 0 and 1.
+    """
+    rows, cells = [], []
+    for k, (epochs, matches) in enumerate(periods):
+        matches = list(matches)
+        used = [np.asarray(table["used"], bool) for table in matches]
+        chosen = [table[mask] for table, mask in zip(matches, used, strict=True)]
+        every = [
+            np.concatenate([np.asarray(table[name], float) for table in chosen])
+            for name in ("dx", "dy")
+        ]
+        statistics = evaluate(*every)
+        row = {
+            "first_epoch": float(np.min(epochs)), "last_epoch": float(np.max(epochs)),
+            "n_frames": len(matches), "n_stars": len(every[0]),
+            **{n: getattr(statistics, n) for n in ("mean_dx", "sigma_dx", "mean_dy", "sigma_dy")},
+            "p_value": np.nan, "drifted": False, "amplitude": 0.0, "area": 0.0,
+        }  # fmt: skip
+        means = mean_in_cells(solution, matches, _GRID)
+        if len(means):
+            drift = detect_drift(solution, matches, false_alarm=false_alarm)
+            row |= {n: getattr(drift, n) for n in ("p_value", "drifted", "amplitude", "area")}
+        means.add_column(np.full(len(means), k), name="period", index=0)
+        rows.append(row)
+        cells.append(means)
+    if not rows:
+        raise ValueError("no period was given")
+    table = QTable(rows)
+    for name in ("mean_dx", "sigma_dx", "mean_dy", "sigma_dy", "amplitude"):
+        table[name].unit = "pix"
+    joined = Table(np.concatenate([np.asarray(c) for c in cells]))
+    for name in cells[0].colnames:
+        joined[name].unit = cells[0][name].unit
+    shape = tuple(int(n) for n in solution.image_shape)
+    return DriftHistory(solution.detector, shape, table, QTable(joined))

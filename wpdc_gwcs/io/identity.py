@@ -1,0 +1,206 @@
+"""Who a frame is: its detector, camera and exposure, and names that differ within a file."""
+
+import re
+from dataclasses import replace
+
+from wpdc_gwcs.io.dates import EXPOSURE_KEYS, header_start
+from wpdc_gwcs.io.exposures import camera_key, exposure_key, has_identifier
+from wpdc_gwcs.io.headers import header_text, positive_number
+
+__all__ = [
+    "NOT_NAMES",
+    "detector_name",
+    "distinct",
+    "exposure_keys",
+    "file_name",
+    "header_facts",
+    "of_one_exposure",
+    "on_its_own",
+]
+
+_DETECTOR_KEYS = (
+    "DETECTOR",
+    "DETNAME",
+    "CCDNAME",
+    "CHIPNAME",
+    "EXTNAME",
+    "CHIPID",
+    "CCDNUM",
+    "CCDCHIP",
+    "CCDID",
+    "IMAGEID",
+)
+_FACTS = {"filter": ("FILTER", "FILTER1", "BAND"), "object": ("OBJECT",), "date": ("DATE-OBS",)}
+# Camera of frames that are tied to others and do not name theirs.
+_CAMERA = "camera"
+#: Names of extensions that name nothing.
+NOT_NAMES = ("PRIMARY", "COMPRESSED_IMAGE", "")
+
+
+def exposure_keys(headers, exposure_keyword, where, chosen=()):
+    """Find camera and exposure; a frame that does not tell its camera is on its own.
+
+    Parameters
+    ----------
+    headers : list of `~astropy.io.fits.Header`
+        That of the frame first, then that of its file.
+    exposure_keyword : str or None
+        Keyword whose value is the exposure; `None` for the usual ones.
+    where : str
+        What messages call the frame.
+    chosen : list of str, optional
+        Words for the plane of a cube.
+
+    Returns
+    -------
+    dict
+        ``camera`` and ``exposure`` of a `~wpdc_gwcs.frame.Frame`.
+    """
+    exposure = exposure_key(headers, keyword=exposure_keyword, name=where)
+    if exposure is not None and chosen:
+        # Planes of a cube are of one detector, and so of different exposures.
+        exposure = "_".join([exposure, *chosen])
+    camera = camera_key(headers)
+    if camera is None and exposure_keyword is not None:
+        camera = _CAMERA
+    return {"camera": camera, "exposure": None if camera is None else exposure}
+
+
+def on_its_own(frame):
+    """Give a frame that no other belongs to.
+
+    Parameters
+    ----------
+    frame : Frame
+        Any frame.
+
+    Returns
+    -------
+    Frame
+        The same without camera and exposure.
+    """
+    return replace(frame, camera=None, exposure=None)
+
+
+def of_one_exposure(frames, parts, path):
+    """Tie the frames of a file, unless identifiers say that they are different exposures.
+
+    Their times need not be the same: each detector may have written its own.
+
+    Parameters
+    ----------
+    frames : list of Frame
+        Frames of one file.
+    parts : list of dict
+        Their ``headers``.
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    list of Frame
+        With camera and exposure.
+    """
+    frames = [replace(f, camera=f.camera or _CAMERA) for f in frames]
+    if len({f.exposure for f in frames}) == 1 and frames[0].exposure is not None:
+        return frames
+    if all(has_identifier(p["headers"]) for p in parts):
+        return frames
+    return [replace(f, exposure=str(path)) for f in frames]
+
+
+def detector_name(headers):
+    """Find the name of a frame's detector.
+
+    Parameters
+    ----------
+    headers : list of `~astropy.io.fits.Header`
+        That of the frame first, then that of its file.
+
+    Returns
+    -------
+    str
+        "detector" where none is named.
+    """
+    # The primary header describes the whole camera: it has no say where the frame's own names one.
+    for header in headers:
+        for key in _DETECTOR_KEYS:
+            text = header_text(header, key)
+            if text.upper() not in (*NOT_NAMES, "LDAC_OBJECTS", "LDAC_IMHEAD"):
+                return text
+    return "detector"
+
+
+def header_facts(headers):
+    """Find what the header tells about an exposure.
+
+    Parameters
+    ----------
+    headers : list of `~astropy.io.fits.Header`
+        That of the frame first, then that of its file.
+
+    Returns
+    -------
+    dict
+        ``filter``, ``object``, ``date``, ``exptime`` in s, ``start`` as MJD: those that are there.
+    """
+    facts = {}
+    for fact, keys in _FACTS.items():
+        text = next((t for h in headers for k in keys if (t := header_text(h, k))), "")
+        if text:
+            facts[fact] = text
+    numbers = {
+        "exptime": positive_number(headers, EXPOSURE_KEYS),
+        "start": header_start(headers),
+    }
+    return facts | {fact: n for fact, n in numbers.items() if n is not None}
+
+
+def distinct(frames, parts):
+    """Make names of frames and detectors of one file differ.
+
+    Parameters
+    ----------
+    frames : list of Frame
+        Frames of one file.
+    parts : list of dict
+        Their ``index`` and ``label`` in it.
+
+    Returns
+    -------
+    list of Frame
+        The same, with numbers in their names where these were alike.
+    """
+    if len(frames) < 2:
+        return frames
+    if len({f.name for f in frames}) < len(frames):
+        frames = [
+            replace(f, name=f"{f.name}_{p['index']}") for f, p in zip(frames, parts, strict=True)
+        ]
+    if len({f.detector for f in frames}) < len(frames):
+        frames = [
+            replace(f, detector=f"{f.detector}_{p['label']}")
+            for f, p in zip(frames, parts, strict=True)
+        ]
+    if len({f.detector for f in frames}) < len(frames):
+        frames = [
+            replace(f, detector=f"{f.detector}_{p['index']}")
+            for f, p in zip(frames, parts, strict=True)
+        ]
+    return frames
+
+
+def file_name(text):
+    """Make a text part of a file's name.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+
+    Returns
+    -------
+    str
+        With underscores for all that file systems may not like.
+    """
+    return re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_") or "image"
