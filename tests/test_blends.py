@@ -117,3 +117,30 @@ def test_rings_are_no_blends():
     table = measure(model, rng)
     found, distance = nearest(table, x, y)
     assert np.mean((distance < 0.5) & (np.asarray(found["flags"]) == 0)) > 0.9
+
+
+@pytest.mark.parametrize(("ratio", "least"), [(0.3, 0.7), (1.0, 0.4)])
+def test_close_bright_pairs_are_fitted_as_well_as_their_light_allows(ratio, least):
+    """Found one after the other, at 1.5 to 1.8 FWHM, where each would take the other's light."""
+    rng = np.random.default_rng(5)
+    x, y = grid(rng)
+    angle = rng.uniform(0, 2 * np.pi, x.size)
+    pair = np.arange(x.size) % 4 == 0
+    flux = 10 ** rng.uniform(4, 5.3, x.size)
+    apart = rng.uniform(1.5, 1.8, pair.sum()) * FWHM
+    x2, y2 = x[pair] + apart * np.cos(angle[pair]), y[pair] + apart * np.sin(angle[pair])
+    both = np.concatenate([x, x2]), np.concatenate([y, y2])
+    table = measure(draw(*both, np.concatenate([flux, ratio * flux[pair]])), rng)
+    found, _ = nearest(table, x[pair], y[pair])
+    other, _ = nearest(table, x2, y2)
+    usable = np.asarray(found["flags"]) == 0
+    assert usable.mean() > least
+    error = np.hypot(found["x"] - x[pair], found["y"] - y[pair])
+    assert np.median(error) < 0.01
+    ratios = np.asarray(other["flux"]) / np.asarray(found["flux"])
+    assert np.median(ratios[usable]) == pytest.approx(ratio, rel=0.02)
+    pulls = np.concatenate(
+        [((found[c] - v[pair]) / found[f"{c}_err"])[usable] for c, v in (("x", x), ("y", y))]
+    )
+    # The error of a neighbor's model is an upper limit.
+    assert 0.5 < 1.4826 * np.median(np.abs(pulls)) < 1.1

@@ -2,9 +2,11 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from photutils.psf import GriddedPSFModel, ImagePSF, PSFPhotometry, SourceGrouper
+from scipy.interpolate import BSpline
 from scipy.special import erf
 
 from wpdc_gwcs.centroids import (
+    _build,
     _profile,
     build_epsf,
     fit_centroids,
@@ -423,3 +425,16 @@ def test_profile_far_from_the_star_is_zero():
     profile = _profile.Profile.constant(samples, 4)
     far = np.array([100.0, -1e6])
     assert (profile.evaluate(far, far, 3, np.ones((2, 1))) == 0).all()
+
+
+def test_splines_with_a_knot_more_are_the_same(rng):
+    """Against the values of scipy's B-splines."""
+    coefficients = np.zeros((21, 3))
+    coefficients[3:-3] = rng.normal(size=(15, 3))
+    finer = _build._halved(coefficients)
+    knots, fine = np.arange(-2.0, 23.0), np.arange(-2.0, 43.0) / 2
+    place = np.linspace(1, 19, 200)
+    assert finer.shape == (41, 3)
+    for before, after in zip(coefficients.T, finer.T, strict=True):
+        expected = BSpline(knots, before, 3)(place)
+        np.testing.assert_allclose(BSpline(fine, after, 3)(place), expected, atol=1e-14)

@@ -4,22 +4,19 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from wpdc_gwcs.centroids._inverses import inverses
-from wpdc_gwcs.centroids._modes import blur_modes, reduced_normal
+from wpdc_gwcs.centroids._joint import cross_products, pairs_that_share
+from wpdc_gwcs.centroids._modes import blur_modes, companions, odd_modes, reduced_normal
 
 __all__ = ["judge_profiles", "weigh_neighbors"]
 
-# Neighbors that share pixels with a fit are at most this far, in radii of the fits.
-_REACH = 1.8
-# Pairs at a time: bounds the memory for their pixels.
+# Stars at a time: bounds the memory for their pixels.
 _CHUNK = 4000
 
-# Significance in sigma of the broadening along the direction where it is greatest, which one star
-# in a hundred exceeds by noise, of any profile.  Where the width is known better than the next
-# number, it is that times the fourth root of how much better: companions of a bright star show far
-# beyond, and bright stars are few.  Where it is known worse than the last one, none show.
-_MAX_BROADENING, _KNOWN, _UNKNOWN = 3.0, 0.025, 0.055
-# Directions tried.
-_N_DIRECTIONS = 12
+# Significance in sigma of the companion that is the most significant one, which two stars in a
+# hundred exceed by noise, of any profile.  Where its share of the light is known better than the
+# next number, it is that times the fourth root of how much better: companions of a bright star show
+# far beyond, and bright stars are few.
+_MAX_COMPANION, _KNOWN = 2.9, 0.017
 # Stars nearest in place, and the best measured of all, that tell how profiles differ.
 _NEAREST, _BEST = 25, 300
 _LEAST = 20
@@ -62,20 +59,12 @@ def weigh_neighbors(field, profile, noise, stars, covariance, radius, unsure):
     :math:`(N_{ii}^{-1} N_{ij})_{xf} f_j`.
     """
     joint, shift = covariance.copy(), np.zeros(len(stars.x))
-    pairs = KDTree(np.column_stack([stars.x, stars.y])).query_pairs(
-        _REACH * radius, output_type="ndarray"
-    )
     fitted = np.isfinite(covariance).all(axis=(1, 2))
-    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    pairs = pairs_that_share(stars, radius)
     if len(pairs) == 0:
         return joint, shift
     i, j = pairs.T
-    cross = np.concatenate(
-        [
-            _products(field, profile, noise, stars.take(i[k]), stars.take(j[k]), radius)
-            for k in (slice(n, n + _CHUNK) for n in range(0, len(i), _CHUNK))
-        ]
-    )
+    cross = cross_products(field, profile, noise, stars, pairs, radius)
     back = np.roll(np.arange(len(i)), len(i) // 2)
     known = fitted[i]
     moved = covariance[i[known]] @ cross[known][:, :, 2:]
@@ -91,21 +80,6 @@ def weigh_neighbors(field, profile, noise, stars, covariance, radius, unsure):
     return joint, np.sqrt(shift)
 
 
-def _products(field, profile, noise, stars, others, radius):
-    """Weighted products (n, 3, 3) of the derivatives of stars and others, in the stars' pixels."""
-    half = int(np.ceil(radius))
-    xc, yc, _, use, sky = field.cut(stars, half, radius)
-    sides = []
-    for side in (stars, others):
-        shares = profile.shares(side.x, side.y)
-        value, by_x, by_y = profile.evaluate(side.x - xc, side.y - yc, half, shares)
-        flux = side.flux[:, None]
-        sides.append(np.stack([flux * by_x, flux * by_y, value], axis=1))
-    model = stars.flux[:, None] * sides[0][:, 2]
-    weight = use / noise.variance(sky, model)
-    return (sides[0] * weight[:, None]) @ sides[1].transpose(0, 2, 1)
-
-
 def _inverse(normal):
     """Inverses of symmetric matrices, NaN where they are not positive definite."""
     scale = np.sqrt(np.abs(np.einsum("sii->si", normal)))
@@ -119,14 +93,14 @@ def _inverse(normal):
 
 
 def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtracted=False):
-    r"""Compare the profiles of stars with that of the frame: broader than their like, or as they.
+    r"""Compare the profiles of stars with that of the frame: two stars, or one as they are.
 
     Parameters
     ----------
     field, profile, noise, radius
         As for `fit_stars`.
     stars : Stars
-        The stars as fitted; those without a fit have no flux.
+        The stars as fitted; those that are not to be judged have no flux.
     clean : (N,) ndarray of bool
         True for those that may tell what stars have in common.
     fwhm : float
@@ -143,12 +117,13 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
 
     Notes
     -----
-    A companion nearer than the PSF is wide, of a share q of the light at :math:`(u, v)`, changes
-    the image to leading order by :math:`\tfrac12 q (1 - q) (u^2 \psi_{uu} + 2 u v \psi_{uv} + v^2
-    \psi_{vv})`; position and flux take up the orders before.  These three amplitudes are fitted,
-    what the nearest bright stars have in common is taken off, and the direction in which the
-    broadening is most significant decides.  How profiles differ from star to star (by color, or
-    because the PSF does not follow) shows in those that are narrower, which no companion makes.
+    A companion nearer than the PSF is wide makes a star broader and one-sided: what is left of its
+    light when position and flux of the star have taken up what they can.  That is, for the most
+    part, a sum of the second and higher derivatives of the profile.  Their amplitudes are fitted,
+    what the nearest bright stars have in common is taken off, and of companions at a grid of places
+    the one that improves :math:`\chi^2` the most decides, one star or two.  How profiles differ
+    from star to star (by color, or because the PSF does not follow) shows in those that are
+    narrower, which no companion makes.
     """
     broad, excess = np.zeros(len(stars.x), bool), np.zeros(len(stars.x))
     rows = np.flatnonzero(stars.flux > 0)
@@ -156,7 +131,9 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     if len(clean) < _LEAST:
         return broad, excess
     stars = stars.take(rows)
-    modes = blur_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)[:3]
+    mean, scale = profile.coefficients.mean(axis=0), fwhm * profile.oversampling
+    modes = blur_modes(mean, scale) + odd_modes(mean, scale)
+    changes = companions(mean, modes, scale)
     options = {"radius": radius, "subtracted": subtracted}
     parts = [
         _normal(field, profile, noise, stars.take(slice(n, n + _CHUNK)), modes, **options)
@@ -166,23 +143,22 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     covariance = inverses(left)
     amplitude = np.einsum("sij,sj->si", covariance, right)
     before = np.einsum("si,sij,sj->s", amplitude, left, amplitude)
-    best = clean[np.argsort(covariance[clean].trace(axis1=1, axis2=2))]
+    size = covariance[clean].trace(axis1=1, axis2=2)
+    best = clean[np.argsort(np.where(size > 0, size, np.inf))]
     best = best[: int(np.clip(len(best) // 4, _LEAST, _BEST))]
     common, unsure = _common(stars, amplitude, covariance, best)
     amplitude -= common
-    differences = _differences(amplitude[best], covariance[best])
+    narrower = amplitude[best] @ changes.mean(axis=1) <= 0
+    differences = _differences(amplitude[best], covariance[best], narrower)
     weight = inverses(covariance + unsure + (1 + _MEDIAN_COST / _NEAREST) * differences)
     after = np.einsum("si,sij,sj->s", amplitude, weight, amplitude)
     excess[rows] = (before - after) / freedom
-    angle = np.pi * np.arange(_N_DIRECTIONS) / _N_DIRECTIONS
-    along = np.stack([np.cos(angle) ** 2, np.cos(angle) * np.sin(angle), np.sin(angle) ** 2])
-    pushed = weight @ along
-    significance = np.einsum("si,sid->sd", amplitude, pushed) / np.sqrt(
-        np.maximum(np.einsum("id,sid->sd", along, pushed), 1e-300)
-    )
-    width = np.sqrt(0.5 * (covariance[:, 0, 0] + covariance[:, 2, 2]))
-    limit = _MAX_BROADENING * np.maximum(_KNOWN / np.maximum(width, 1e-9), 1) ** 0.25
-    broad[rows] = (significance.max(axis=1) > limit) & (width < _UNKNOWN)
+    pushed = weight @ changes
+    # One over the error of a companion's share of the light.
+    known = np.sqrt(np.maximum(np.einsum("id,sid->sd", changes, pushed), 1e-300))
+    significance = np.einsum("si,sid->sd", amplitude, pushed) / known
+    limit = _MAX_COMPANION * np.maximum(_KNOWN * known.mean(axis=1), 1) ** 0.25
+    broad[rows] = significance.max(axis=1) > limit
     return broad, excess
 
 
@@ -198,24 +174,27 @@ def _normal(field, profile, noise, stars, modes, *, radius, subtracted):
 
 def _common(stars, amplitude, covariance, best):
     """Median amplitudes of the nearest of the best measured stars, and their covariance."""
-    tree = KDTree(np.column_stack([stars.x[best], stars.y[best]]))
+    places = np.column_stack([stars.x, stars.y])
+    tree = KDTree(places[best])
     k = min(_NEAREST, len(best))
-    near = best[tree.query(np.column_stack([stars.x, stars.y]), k=k)[1]]
+    near = best[tree.query(places[best], k=k)[1]]
     noise = _MEDIAN_COST / k * covariance[near].mean(axis=1)
-    return np.median(amplitude[near], axis=1), noise
+    # Those of the best star next to it, which differ little from its own.
+    nearest = tree.query(places)[1]
+    return np.median(amplitude[near], axis=1)[nearest], noise[nearest]
 
 
-def _differences(amplitude, covariance):
-    """Covariance (3, 3) of how profiles differ from star to star.
+def _differences(amplitude, covariance, narrower):
+    """Covariance (R, R) of how profiles differ from star to star.
 
     By color, brightness or a place that the PSF does not follow.  Those stars tell that are
     narrower than usual, which no companion makes; of few stars all do, since the brightest of them
     make the PSF.
     """
-    width = amplitude[:, 0] + amplitude[:, 2]
-    told = np.abs(width) < _OUTLIER * np.median(np.abs(width))
-    if len(width) > _FEW:
-        told &= width <= 0
+    size = np.linalg.norm(amplitude, axis=1)
+    told = size < _OUTLIER * np.median(size)
+    if len(size) > _FEW:
+        told &= narrower
     seen = np.einsum("si,sj->ij", amplitude[told], amplitude[told]) / max(told.sum(), 1)
     sizes, axes = np.linalg.eigh(seen - covariance[told].mean(axis=0))
     return (axes * np.maximum(sizes, 0)) @ axes.T

@@ -8,11 +8,12 @@ from scipy.linalg import LinAlgError, solveh_banded
 from scipy.spatial import KDTree
 
 from wpdc_gwcs.centroids._fit import fit_stars, star_like
-from wpdc_gwcs.centroids._modes import blur_modes, reduced_normal
+from wpdc_gwcs.centroids._modes import blur_modes, odd_modes, reduced_normal
 from wpdc_gwcs.centroids._noise import bin_noise, estimate_noise
 from wpdc_gwcs.centroids._profile import (
     Profile,
     moffat_samples,
+    shift_matrix,
     spline_coefficients,
     spline_taps,
 )
@@ -34,6 +35,10 @@ _SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 # of its fourth differences (in units of a Gaussian's), and of itself.
 _ROUGHNESS = 0.4
 _DEVIATION = 0.3
+
+# FWHM in px of the finest structure from which knots every half pixel follow it as well as those
+# every quarter: to a thousandth for a Gaussian.  Wide profiles are quicker with them.
+_HALF_PIXEL_KNOTS = 1.8
 
 # Places along each axis at which a varying profile is tabulated.
 _N_NODES = 5
@@ -213,7 +218,7 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
     return profile, fits.stars.take(fits.valid), noise
 
 
-def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
+def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree, lean=False):
     r"""Let the width and the shape of a profile vary smoothly over the detector.
 
     Parameters
@@ -230,6 +235,8 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
         Radius in px of the pixels used.
     degree : int
         Degree of the polynomials in position.
+    lean : bool, optional
+        Whether its asymmetry may vary as well.
 
     Returns
     -------
@@ -245,10 +252,14 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
         \psi(u, v; X, Y) = \psi + a_1 \psi_{uu} + a_2 \psi_{uv} + a_3 \psi_{vv}
                             + a_4 \nabla^4 \psi
 
-    with polynomials :math:`a_k(X, Y)`.  None of these has a first moment: the meaning of the
-    position stays the same all over the detector.
+    with polynomials :math:`a_k(X, Y)`.  Coma, which grows off the axis of any telescope, changes
+    the third derivatives.  None of these has a first moment: the meaning of the position stays the
+    same all over the detector.
     """
-    modes = blur_modes(profile.coefficients[0], fwhm * profile.oversampling)
+    scale = fwhm * profile.oversampling
+    modes = blur_modes(profile.coefficients[0], scale)
+    if lean:
+        modes += odd_modes(profile.coefficients[0], scale)
     left, right = reduced_normal(field, profile, noise, stars, modes, radius)
     ny, nx = field.image.shape
     terms = _polynomial_terms(stars.x / nx, stars.y / ny, degree)
@@ -276,7 +287,8 @@ def _polynomial_terms(x, y, degree):
 
 def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
     """Spline coefficients that take up what a profile leaves: penalised least squares."""
-    over, size = profile.oversampling, profile.coefficients.shape[-1]
+    stride = 2 if finest >= _HALF_PIXEL_KNOTS else 1
+    over, size = profile.oversampling // stride, (profile.coefficients.shape[-1] - 1) // stride + 1
     half = profile.radius - 1
     xc, yc, pixels, use, sky = field.cut(stars, half, np.inf)
     x, y, flux = stars
@@ -298,7 +310,6 @@ def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
     band = np.zeros((width, size * size))
     right = np.zeros(size * size)
     cell = base_y * 1000 + base_x
-    # The four taps of a pixel end before those of the next begin, so no place is met twice.
     step = over * np.arange(-half, half + 1)
     tap = np.arange(-1, 3)
     for value in np.unique(cell):
@@ -306,28 +317,50 @@ def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
         iy = base_y[k[0]] + step[:, None] + tap
         ix = base_x[k[0]] + step[:, None] + tap
         index = (iy[:, None, :, None] * size + ix[None, :, None, :]).reshape(-1, 16)
-        right[index] += (weight[k] * residual[k]).T @ taps[k]
-        column = index[:, second]
-        band[index[:, first] - column, column] += weight[k].T @ squares[k]
-    _add_prior(band, profile.samples().mean(axis=0), fwhm, finest, over)
+        for tile in _tiles(half, over):
+            right[index[tile]] += (weight[k][:, tile] * residual[k][:, tile]).T @ taps[k]
+            column = index[tile][:, second]
+            band[index[tile][:, first] - column, column] += weight[k][:, tile].T @ squares[k]
+    prior = profile.samples().mean(axis=0)[::stride, ::stride]
+    _add_prior(band, prior, fwhm, finest, over, stride**2)
     try:
         solution = solveh_banded(band, right, lower=True, overwrite_ab=True, check_finite=False)
     except LinAlgError:
-        return np.zeros((size, size))
-    return solution.reshape(size, size)
+        return np.zeros_like(profile.coefficients[0])
+    solution = solution.reshape(size, size)
+    return solution if stride == 1 else _halved(_halved(solution).T).T
 
 
-def _add_prior(band, samples, fwhm, finest, over):
-    """Add the expectation that a difference is small and smooth to banded normal equations."""
+def _tiles(half, over):
+    """Pixels of cut-outs, in parts in which no two have a knot in common."""
+    apart = 4 // over
+    place = np.arange((2 * half + 1) ** 2).reshape(2 * half + 1, -1)
+    return [place[i::apart, j::apart].ravel() for i in range(apart) for j in range(apart)]
+
+
+def _halved(coefficients):
+    """Coefficients, along the first axis, of the same splines with a knot more between any two."""
+    padded = np.pad(coefficients, ((1, 1), (0, 0)))
+    finer = np.empty((2 * len(coefficients) - 1, coefficients.shape[1]))
+    finer[::2] = (padded[:-2] + 6 * coefficients + padded[2:]) / 8
+    finer[1::2] = (coefficients[:-1] + coefficients[1:]) / 2
+    return finer
+
+
+def _add_prior(band, samples, fwhm, finest, over, area):
+    """Add the expectation that a difference is small and smooth to banded normal equations.
+
+    The area is that of a cell of the grid, in those of the finest grid, which weigh one each.
+    """
     size = samples.shape[0]
     center = (size - 1) // 2
     radius = np.hypot(*np.meshgrid(np.arange(size) - center, np.arange(size) - center)) / over
     # A smooth envelope of the profile, with wings that stay open for spikes and haloes.
     envelope = samples.max() * (1 + (2 * radius / fwhm) ** 2 * (2**0.5 - 1)) ** -2
     sigma = finest * _SIGMA_PER_FWHM * over  # grid steps
-    rough = (_ROUGHNESS * 3 * sigma**-4 * envelope) ** -2
+    rough = area * (_ROUGHNESS * 3 * sigma**-4 * envelope) ** -2
     # Where there is finer structure than in a star of this width, the start is only its outline.
-    own = (_DEVIATION * (fwhm / finest) * envelope) ** -2
+    own = area * (_DEVIATION * (fwhm / finest) * envelope) ** -2
     # Nothing is known about the rim: the profile there is the start's.
     rim = np.abs(np.arange(size) - center) > center - over
     own[rim] *= 1e8
@@ -364,18 +397,7 @@ def _centered(profile, fwhm):
             shift += step
             if np.abs(step).max() < 1e-7:
                 break
-        matrix_x, matrix_y = (_shift_matrix(size, over * s) for s in shift)
+        matrix_x, matrix_y = (shift_matrix(size, over * s) for s in shift)
         grid = matrix_y @ coefficients @ matrix_x.T
         moved.append(grid * over**2 / grid.sum())
     return replace(profile, coefficients=spline_coefficients(np.stack(moved)))
-
-
-def _shift_matrix(size, shift):
-    """Matrix from spline coefficients to values on the grid moved by a shift in grid steps."""
-    base, taps, _ = spline_taps(np.arange(size) + shift)
-    column = base[:, None] + np.arange(-1, 3)
-    inside = (column >= 0) & (column < size)
-    matrix = np.zeros((size, size))
-    row = np.broadcast_to(np.arange(size)[:, None], column.shape)
-    matrix[row[inside], column[inside]] = taps[inside]
-    return matrix

@@ -1,6 +1,6 @@
 """Weighted least squares for the position and flux of many stars at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ __all__ = [
     "Stars",
     "fit_radius",
     "fit_stars",
+    "normal_step",
     "star_like",
 ]
 
@@ -198,6 +199,13 @@ class StarFits:
         x, y, flux, *rest = columns
         return StarFits(Stars(x, y, flux), *rest)
 
+    def moved(self, rows, stars):
+        """Return these fits with other positions and fluxes of some."""
+        columns = [old.copy() for old in self.stars]
+        for column, new in zip(columns, stars, strict=True):
+            column[rows] = new
+        return replace(self, stars=Stars(*columns))
+
     def _columns(self):
         return *self.stars, self.covariance, self.chi2, self.valid
 
@@ -258,15 +266,15 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
     x, y, flux = (np.array(v, dtype=float) for v in stars)
     shares = profile.shares(x, y)
     flux = np.maximum(flux, 1e-6)
-    x0, y0 = x.copy(), y.copy()
+    x0, y0, positions = x.copy(), y.copy(), noise.of_positions
     converged = np.zeros(len(x), bool)
     active = np.arange(len(x))
     for _ in range(_MAX_ITERATIONS):
         basis = profile.evaluate(
             x[active] - xc[active], y[active] - yc[active], half, shares[active]
         )
-        step, *_rest = _normal_step(
-            basis, flux[active], pixels[active], use[active], sky.take(active), noise
+        step, *_rest = normal_step(
+            basis, flux[active], pixels[active], use[active], sky.take(active), positions
         )
         shift = np.clip(step[:, :2], -_MAX_STEP, _MAX_STEP)
         x[active] += shift[:, 0]
@@ -285,15 +293,38 @@ def _fit_chunk(field, profile, noise, stars, radius, own):
         # Slow but close enough: what is left is far below the error.
         converged[active] = np.abs(shift[~done & ~away]).max(axis=1, initial=0) < 3e-3
     basis = profile.evaluate(x - xc, y - yc, half, shares)
-    _step, covariance, chi2 = _normal_step(basis, flux, pixels, use, sky, noise)
+    _step, covariance, chi2 = normal_step(basis, flux, pixels, use, sky, positions)
+    if positions.mismatch != noise.mismatch:
+        _step, _covariance, chi2 = normal_step(basis, flux, pixels, use, sky, noise)
     positive = np.einsum("sii->si", covariance).min(axis=1, initial=np.inf) > 0
     valid = converged & positive & np.isfinite(chi2)
     covariance[~valid] = np.nan
     return x, y, flux, covariance, chi2, valid
 
 
-def _normal_step(basis, flux, pixels, use, sky, noise):
-    """Gauss-Newton step (N, 3), covariance (N, 3, 3) and reduced chi square."""
+def normal_step(basis, flux, pixels, use, sky, noise):
+    """Take a Gauss-Newton step of every star.
+
+    Parameters
+    ----------
+    basis : (3, N, n) ndarray
+        Profiles and their derivatives.
+    flux : (N,) ndarray
+        Fluxes.
+    pixels, use, sky
+        As from `Field.cut`.
+    noise : Noise
+        Variance of the pixels.
+
+    Returns
+    -------
+    step : (N, 3) ndarray
+        Steps of x, y and flux.
+    covariance : (N, 3, 3) ndarray
+        Their covariance; NaN where the equations are singular.
+    chi2 : (N,) ndarray
+        Chi square per degree of freedom.
+    """
     n = len(flux)
     step, covariance, chi2 = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
     photons = None if np.isscalar(sky.photons) else np.ascontiguousarray(sky.photons, dtype=float)

@@ -31,6 +31,9 @@ __all__ = [
 _LEAST_PHOTONS = 0.1
 # Reduced chi square up to which the formal errors stand; beyond, they grow with its root.
 _TOLERATED_CHI2 = 1.5
+# Share of the wobble of the center of light with the place in the pixel that one frame cannot tell:
+# by so much it depends on the kind of profile that the PSF is learnt from.
+_UNKNOWN_WOBBLE = 0.3
 
 
 def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0, vary="auto"):
@@ -163,7 +166,8 @@ def fit_centroids(
     error : float or (ny, nx) array_like, optional
         Standard deviation of the background; only for a plain array.
     passes : int, optional
-        Number of rounds; from the second on, the neighbors' models are subtracted.
+        Number of rounds; from the second on, the neighbors' models are subtracted, and stars that
+        share pixels are improved together.
     refit : bool, optional
         The sources have been fitted before, or found beside such: neighbors are subtracted from
         the first round on.  A source on the flank of a brighter one needs that.
@@ -195,11 +199,17 @@ def fit_centroids(
         \sigma^2 = \sigma_\mathrm{sky}^2 + f \psi / g
                    + \epsilon^2 f^2 \psi \psi_\mathrm{max} .
 
+    For positions and their errors :math:`\epsilon` is that part which is odd about the star, for
+    :math:`\chi^2` all of it.
+
     The errors are those of all stars fitted together: of the normal matrix with the neighbors
     eliminated, times :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1, and what is wrong in
-    the models of the neighbors besides.  Where neighbors cost a star more than half of its error
-    and more than 0.01 px, `wpdc_gwcs.detection.FLAG_BLENDED` is set, and it is cleared elsewhere;
-    where the profile is broader than those of other stars, `wpdc_gwcs.detection.FLAG_EXTENDED`.
+    the models of the neighbors besides, and 0.3 of the wobble of the center of light with the place
+    in the pixel, which matters below a FWHM of 1.5 px.
+
+    Where neighbors cost a star more than half of its error and more than 0.01 px,
+    `wpdc_gwcs.detection.FLAG_BLENDED` is set, and it is cleared elsewhere; where two stars describe
+    a profile better than one, `wpdc_gwcs.detection.FLAG_EXTENDED`.
 
     Examples
     --------
@@ -243,6 +253,7 @@ def fit_centroids(
     shift = np.zeros(len(stars.x))
     if judge:
         fits, shift, flags = judge_neighbors(scene, profile, noise, fits, stars, flags, fwhm)
+        shift = np.hypot(shift, _UNKNOWN_WOBBLE * profile.wobble())
     return _fitted_table(sources, fits, shift, flags, fwhm, unit)
 
 
@@ -350,13 +361,13 @@ def measure_noise(data, sources, epsf, *, error=None):
     fwhm = _typical_fwhm(sources)
     stars = _stars_of(sources, unit)
     quality = select_sources(sources)
-    bins, n = noise_bins(field, from_photutils(epsf), stars, quality, fwhm, None)
+    bins, clean, _ = noise_bins(field, from_photutils(epsf), stars, quality, fwhm, None)
     noise = estimate_noise(bins)
     gain = np.nan
     if bins is not None:
         photons = np.median(noise.inverse_gain * bins.photons / bins.measured)
         gain = 1 / (noise.inverse_gain * unit) if photons > _LEAST_PHOTONS else np.nan
-    return StarNoise(float(gain), least_gain(bins) / unit, noise.mismatch, n)
+    return StarNoise(float(gain), least_gain(bins) / unit, noise.mismatch, len(clean.x))
 
 
 def _fitted_table(sources, fits, shift, flags, fwhm, unit):

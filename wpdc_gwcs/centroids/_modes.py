@@ -1,14 +1,17 @@
-"""Small changes of a profile: a little more or less blur in any direction."""
+"""Small changes of a profile: more or less blur, light on one side, a companion."""
 
 import numpy as np
 
 from wpdc_gwcs.centroids._inverses import inverses
-from wpdc_gwcs.centroids._profile import Profile
+from wpdc_gwcs.centroids._profile import Profile, shift_matrix, spline_coefficients
 
-__all__ = ["blur_modes", "mode_profiles", "reduced_normal"]
+__all__ = ["blur_modes", "companions", "mode_profiles", "odd_modes", "reduced_normal"]
 
 # Pixels further off the model than this many sigma weigh as if they were there.
 _HUBER = 3.0
+
+# Places of companions: distances in FWHM, and directions.
+_DISTANCES, _N_ANGLES = (0.6, 0.9), 12
 
 
 def blur_modes(coefficients, scale):
@@ -26,28 +29,74 @@ def blur_modes(coefficients, scale):
     list of (M, M) ndarray
         Coefficients of the second derivatives and of the squared Laplacian, in units of scale.
     """
-
-    def along(c, axis):
-        padded = np.pad(c, [(1, 1) if a == axis else (0, 0) for a in (0, 1)])
-        low, high = (np.take(padded, np.arange(n, n + c.shape[axis]), axis) for n in (0, 2))
-        return low, high
-
-    def second(c, axis):
-        low, high = along(c, axis)
-        return (low - 2 * c + high) * scale**2
-
-    def first(c, axis):
-        low, high = along(c, axis)
-        return 0.5 * (high - low) * scale
-
-    xx, yy = second(coefficients, 1), second(coefficients, 0)
+    xx, yy = _second(coefficients, 1, scale), _second(coefficients, 0, scale)
     laplacian = xx + yy
     return [
         xx / 8,
-        first(first(coefficients, 0), 1) / 4,
+        _first(_first(coefficients, 0, scale), 1, scale) / 4,
         yy / 8,
-        (second(laplacian, 0) + second(laplacian, 1)) / 128,
+        (_second(laplacian, 0, scale) + _second(laplacian, 1, scale)) / 128,
     ]
+
+
+def odd_modes(coefficients, scale):
+    """Change of a profile by a little more light on one side, in the directions there are.
+
+    Parameters
+    ----------
+    coefficients, scale
+        As for `blur_modes`.
+
+    Returns
+    -------
+    list of (M, M) ndarray
+        Coefficients of the four third derivatives, in units of scale.
+    """
+    xx, yy = _second(coefficients, 1, scale), _second(coefficients, 0, scale)
+    return [_first(c, axis, scale) / 16 for c in (xx, yy) for axis in (1, 0)]
+
+
+def companions(coefficients, modes, scale):
+    """Change of a profile by the light of a companion, in modes and what no shift or flux makes.
+
+    Parameters
+    ----------
+    coefficients, scale
+        As for `blur_modes`.
+    modes : list of (M, M) ndarray
+        R modes.
+
+    Returns
+    -------
+    (R, K) ndarray
+        Amplitudes of the modes for each of K places of a companion as bright as the star.
+    """
+    size = len(coefficients)
+    angle = 2 * np.pi * np.arange(_N_ANGLES) / _N_ANGLES
+    x, y = (np.outer(_DISTANCES, f(angle)).ravel() * scale for f in (np.cos, np.sin))
+    shifted = [
+        shift_matrix(size, -v) @ coefficients @ shift_matrix(size, -u).T
+        for u, v in zip(x, y, strict=True)
+    ]
+    own = [coefficients, *(_first(coefficients, axis, scale) for axis in (0, 1))]
+    basis = np.stack([*own, *modes]).reshape(len(own) + len(modes), -1)
+    shifted = spline_coefficients(np.stack(shifted)).reshape(len(x), -1)
+    return np.linalg.solve(basis @ basis.T, basis @ shifted.T)[len(own) :]
+
+
+def _neighbors(c, axis):
+    padded = np.pad(c, [(1, 1) if a == axis else (0, 0) for a in (0, 1)])
+    return (np.take(padded, np.arange(n, n + c.shape[axis]), axis) for n in (0, 2))
+
+
+def _first(c, axis, scale):
+    low, high = _neighbors(c, axis)
+    return 0.5 * (high - low) * scale
+
+
+def _second(c, axis, scale):
+    low, high = _neighbors(c, axis)
+    return (low - 2 * c + high) * scale**2
 
 
 def mode_profiles(modes, oversampling):

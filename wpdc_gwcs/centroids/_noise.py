@@ -8,10 +8,13 @@ from scipy.optimize import least_squares
 
 from wpdc_gwcs.centroids._inverses import inverses
 
-__all__ = ["Noise", "NoiseBins", "bin_noise", "estimate_noise", "least_gain"]
+__all__ = ["Noise", "NoiseBins", "bin_noise", "bin_odd_noise", "estimate_noise", "least_gain"]
 
 # Error of the profile below which nobody's data can tell.
-_MIN_MISMATCH = 0.002
+_MIN_MISMATCH = 0.0005
+
+# Median of a chi square with four degrees of freedom, for each of them; stars in a bin.
+_MEDIAN_OF_FOUR, _STARS_OF_BIN = 0.839, 15
 
 # Noise of stars shows where it is so many times that of the sky, in so many bins.
 _ABOVE_SKY, _MIN_BINS = 2.0, 3
@@ -27,6 +30,8 @@ class Noise:
         Counts per electron.
     mismatch : float
         Error of the profile at its peak, relative to its value there.
+    asymmetry : float or None
+        That part of it that is odd about the star; None for all of it.
 
     Notes
     -----
@@ -34,10 +39,20 @@ class Noise:
     model's counts.  The error of the profile has the form of photon noise, so that the brightest
     stars are fitted with the same relative weights as those with photon noise alone; the same
     relative error everywhere would shift them by whatever asymmetry the wings have.
+
+    An error of the width, or of any ring about the star, makes the fit worse and moves nobody: the
+    derivatives by the position are odd about the star, and the sums with what is even vanish.
     """
 
     inverse_gain: float = 0.0
     mismatch: float = 0.02
+    asymmetry: float | None = None
+
+    @property
+    def of_positions(self):
+        """The noise that moves stars, for the weights and errors of their positions."""
+        odd = self.mismatch if self.asymmetry is None else self.asymmetry
+        return Noise(self.inverse_gain, odd)
 
     def variance(self, sky, model):
         """Variance for pixels of given sky and model counts."""
@@ -135,6 +150,65 @@ def _medians(values, n_bins):
         ],
         axis=-1,
     )
+
+
+def bin_odd_noise(field, profile, noise, stars, modes, *, radius, own=None):
+    r"""Measure the noise in what is odd about well measured stars, as the shift of a star is.
+
+    Parameters
+    ----------
+    field, profile, stars, radius, own
+        As for `bin_noise`.
+    noise : Noise
+        Its photons count.
+    modes : sequence of Profile
+        Four changes of the profile that are odd about the star.
+
+    Returns
+    -------
+    NoiseBins or None
+        Variances in units of those by sky and photons; None where there are too few stars.
+
+    Notes
+    -----
+    The amplitudes of the modes are fitted with position and flux.  Their chi square is that of sky
+    and photons, and grows with the square of the profile's error by :math:`\mathrm{tr}(N^{-1} B) /
+    4`, where N is the normal matrix and B what the form of that error makes of it.
+    """
+    if len(stars.x) < 2 * _STARS_OF_BIN:
+        return None
+    half = int(np.ceil(radius))
+    xc, yc, pixels, use, sky = field.cut(stars, half, radius)
+    if own is not None:
+        pixels += own.light(profile, xc, yc, half)
+    basis = profile.evaluate(stars.x - xc, stars.y - yc, half, profile.shares(stars.x, stars.y))
+    flux = stars.flux[:, None]
+    model = flux * basis[0]
+    weight = use / Noise(noise.inverse_gain, 0.0).variance(sky, model)
+    one = np.ones((len(flux), 1))
+    odd = [m.evaluate(stars.x - xc, stars.y - yc, half, one, gradient=False)[0] for m in modes]
+    fitted = np.stack([basis[0], flux * basis[1], flux * basis[2]], axis=1)
+    odd = flux[:, None] * np.stack(odd, axis=1)
+    weighted = fitted * weight[:, None]
+    normal = weighted @ fitted.transpose(0, 2, 1)
+    odd -= (inverses(normal) @ (weighted @ odd.transpose(0, 2, 1))).transpose(0, 2, 1) @ fitted
+    weighted = odd * weight[:, None]
+    left = weighted @ odd.transpose(0, 2, 1)
+    inverse = inverses(left)
+    right = (weighted @ (pixels - model)[:, :, None])[:, :, 0]
+    square = np.maximum(model, 0) * model.max(axis=1, keepdims=True)
+    error = (weighted * square[:, None]) @ weighted.transpose(0, 2, 1)
+    square = np.einsum("sij,sji->s", inverse, error) / 4
+    # What all stars have in common shifts them alike, which no star can tell from where it is.
+    share = 1 / (1 + noise.mismatch**2 * square)
+    common = np.linalg.pinv(np.einsum("s,sij->ij", share, left)) @ (share @ right)
+    right -= left @ common
+    chi2 = np.einsum("si,sij,sj->s", right, inverse, right) / 4
+    order = np.argsort(square)
+    bins = np.array_split(order, int(np.clip(len(order) // _STARS_OF_BIN, 1, 40)))
+    measured = np.array([np.median(chi2[b]) for b in bins]) / _MEDIAN_OF_FOUR + 1e-30
+    ones = np.ones(len(bins))
+    return NoiseBins(measured, ones, ones, np.array([np.median(square[b]) for b in bins]))
 
 
 def estimate_noise(bins, gain=None):

@@ -8,7 +8,14 @@ from scipy.ndimage import spline_filter, uniform_filter1d
 
 from wpdc_gwcs import kernels
 
-__all__ = ["Models", "Profile", "moffat_samples", "spline_coefficients", "spline_taps"]
+__all__ = [
+    "Models",
+    "Profile",
+    "moffat_samples",
+    "shift_matrix",
+    "spline_coefficients",
+    "spline_taps",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +64,26 @@ class Profile:
         c = np.pad(self.coefficients, ((0, 0), (1, 1), (1, 1)))
         c = (c[:, :-2] + 4 * c[:, 1:-1] + c[:, 2:]) / 6
         return (c[:, :, :-2] + 4 * c[:, :, 1:-1] + c[:, :, 2:]) / 6
+
+    def wobble(self):
+        r"""Find by how much the center of light moves about the star with its place in the pixel.
+
+        Returns
+        -------
+        float
+            Root mean square over all places, along one axis, in px.
+
+        Notes
+        -----
+        With :math:`\psi_x` the profile summed along the other axis, that is :math:`\sqrt 2\,
+        |\int u\, \psi_x(u)\, e^{-2 \pi i u} du|`: what light there is at one cycle per pixel.
+        """
+        samples = self.samples().mean(axis=0)
+        step = (np.arange(len(samples)) - self._center) / self.oversampling
+        wave = step * np.exp(-2j * np.pi * step) / samples.sum()
+        return float(
+            np.sqrt(np.mean([np.abs(wave @ samples.sum(axis=k)) ** 2 for k in (0, 1)]) * 2)
+        )
 
     @cached_property
     def _components(self):
@@ -281,6 +308,30 @@ def moffat_samples(shape, half, oversampling):
         :, oversampling * fine : -oversampling * fine : fine
     ]
     return samples / samples.sum() * oversampling**2
+
+
+def shift_matrix(size, shift):
+    """Make the matrix from spline coefficients to values on a grid that is moved.
+
+    Parameters
+    ----------
+    size : int
+        Number of coefficients.
+    shift : float
+        Grid steps by which the grid is moved.
+
+    Returns
+    -------
+    (size, size) ndarray
+        Matrix.
+    """
+    base, taps, _ = spline_taps(np.arange(size) + shift)
+    column = base[:, None] + np.arange(-1, 3)
+    inside = (column >= 0) & (column < size)
+    matrix = np.zeros((size, size))
+    row = np.broadcast_to(np.arange(size)[:, None], column.shape)
+    matrix[row[inside], column[inside]] = taps[inside]
+    return matrix
 
 
 def _hat(position, nodes):

@@ -1,4 +1,4 @@
-"""Fits of all stars in turn, their neighbors' light taken off, and what the neighbors cost."""
+"""Fits of all stars, their neighbors' light taken off, and what the neighbors cost."""
 
 import logging
 from dataclasses import replace
@@ -8,8 +8,9 @@ import numpy as np
 from wpdc_gwcs.centroids._blends import judge_profiles, weigh_neighbors
 from wpdc_gwcs.centroids._build import isolated
 from wpdc_gwcs.centroids._fit import StarFits, Stars, fit_radius, fit_stars, star_like
-from wpdc_gwcs.centroids._modes import blur_modes, mode_profiles
-from wpdc_gwcs.centroids._noise import Noise, bin_noise, estimate_noise
+from wpdc_gwcs.centroids._joint import joint_step
+from wpdc_gwcs.centroids._modes import blur_modes, mode_profiles, odd_modes
+from wpdc_gwcs.centroids._noise import Noise, bin_noise, bin_odd_noise, estimate_noise
 from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EXTENDED, FLAG_SATURATED
 from wpdc_gwcs.threads import one_blas_thread
 
@@ -26,6 +27,11 @@ MAX_CHI2 = 4.0
 # Relative error of a neighbor's light beside its core: what any PSF is known to at best, what that
 # of a saturated star is, whose flux comes from its wings, and that of a source that has no model.
 _LEAST_ERROR, _SATURATED_ERROR, _NO_MODEL = 0.02, 0.2, 1.0
+# Steps together before any star is fitted again: a companion that was found in what a fit had left
+# of it would lose its place beside a star that has taken half of its light.
+_FIRST_STEPS = 2
+# Signal-to-noise ratio of stars from which companions under them show.
+_LEAST_SNR = 15.0
 # A star is blended where its neighbors cost it more than this many times the error it would have
 # alone, and more than so many px.
 _MAX_COST, _TOLERATED_COST = 1.5, 0.01
@@ -53,8 +59,10 @@ def noise_bins(field, profile, stars, quality, fwhm, gain, *, own=None):
     -------
     bins : NoiseBins or None
         As from `bin_noise`.
-    n : int
-        How many stars they are of.
+    clean : Stars
+        The stars that they are of, as fitted.
+    own : Stars or None
+        Their models that were subtracted.
     """
     radius = fit_radius(fwhm)
     noise = Noise(0.0 if gain is None else 1 / gain)
@@ -65,24 +73,30 @@ def noise_bins(field, profile, stars, quality, fwhm, gain, *, own=None):
     rows = rows[np.argsort(stars.flux[rows])[::-1][:_MAX_STARS]]
     own = None if own is None else own.take(rows)
     fits = fit_stars(field, profile, noise, stars.take(rows), radius=radius, own=own)
-    clean = star_like(fits.stars.flux, fits.chi2, fits.valid)
+    alike = star_like(fits.stars.flux, fits.chi2, fits.valid)
+    clean, own = fits.stars.take(alike), None if own is None else own.take(alike)
     # A star that is a little broader or sharper than others has no worse position.
     blur = blur_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)
-    bins = bin_noise(
-        field,
-        profile,
-        noise,
-        fits.stars.take(clean),
-        radius=radius,
-        modes=mode_profiles(blur[:3], profile.oversampling),
-        own=None if own is None else own.take(clean),
+    modes = mode_profiles(blur[:3], profile.oversampling)
+    bins = bin_noise(field, profile, noise, clean, radius=radius, modes=modes, own=own)
+    return bins, clean, own
+
+
+def _with_asymmetry(noise, field, profile, stars, own, fwhm):
+    """Noise that knows what part of the profile's error is odd about the star."""
+    odd = odd_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)
+    modes = mode_profiles(odd, profile.oversampling)
+    radius = fit_radius(fwhm)
+    bins = bin_odd_noise(field, profile, noise, stars, modes, radius=radius, own=own)
+    # The photons are in the units of these bins.
+    return (
+        noise if bins is None else replace(noise, asymmetry=estimate_noise(bins, np.inf).mismatch)
     )
-    return bins, int(clean.sum())
 
 
 @one_blas_thread
 def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
-    """Fit all stars in turn.
+    """Fit all stars, and improve those that share pixels together.
 
     Parameters
     ----------
@@ -111,22 +125,47 @@ def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
         Noise of the pixels.
     """
     radius = fit_radius(fwhm)
-    bins, _ = noise_bins(scene.field, profile, stars, quality, fwhm, gain, own=scene.own)
+    bins, *clean = noise_bins(scene.field, profile, stars, quality, fwhm, gain, own=scene.own)
     noise = estimate_noise(bins, gain)
+    noise = _with_asymmetry(noise, scene.field, profile, *clean, fwhm)
     log.debug("noise of the fits: %s", noise)
     fits, rows = StarFits.unfitted(stars), np.arange(len(stars.x))
     if refit:
-        scene.draw(_modelled(fits, stars, fwhm), radius)
-    for k in range(passes):
-        start = _modelled(fits, stars, fwhm).take(rows) if k or refit else stars
-        own = None if scene.own is None else scene.own.take(rows)
-        again = fit_stars(scene.field, profile, noise, start, radius=radius, own=own)
-        fits = fits.updated(rows, again)
-        rows = scene.draw(_modelled(fits, stars, fwhm), radius)
+        touched = scene.draw(_modelled(fits, stars, fwhm), radius)
+        for _ in range(_FIRST_STEPS):
+            fits, touched = _step_together(scene, profile, noise, fits, stars, touched, fwhm)
+    start = _modelled(fits, stars, fwhm) if refit else stars
+    fits = _fit_again(scene, profile, noise, start, rows, radius)
+    rows, moved = scene.draw(_modelled(fits, stars, fwhm), radius), []
+    for k in range(1, passes):
         log.debug("round %d: the light beside %d stars has changed", k, len(rows))
         if len(rows) == 0:
             break
+        moved.append(rows)
+        fits, rows = _step_together(scene, profile, noise, fits, stars, rows, fwhm)
+    if moved:
+        rows = np.unique(np.concatenate([rows, *moved]))
+        start = _modelled(fits, stars, fwhm).take(rows)
+        fits = fits.updated(rows, _fit_again(scene, profile, noise, start, rows, radius))
+        scene.draw(_modelled(fits, stars, fwhm), radius)
     return fits, noise
+
+
+def _step_together(scene, profile, noise, fits, start, rows, fwhm):
+    """Fits after a step of some stars together, and the rows beside which that changes light."""
+    radius = fit_radius(fwhm)
+    rows = rows[scene.drawn.flux[rows] > 0]
+    if len(rows) == 0:
+        return fits, rows
+    step = joint_step(scene.field, profile, noise.of_positions, scene.drawn, rows, radius)
+    fits = fits.moved(rows, step)
+    return fits, scene.draw(_modelled(fits, start, fwhm), radius)
+
+
+def _fit_again(scene, profile, noise, start, rows, radius):
+    """Fits of some stars, the others where they are."""
+    own = None if scene.own is None else scene.own.take(rows)
+    return fit_stars(scene.field, profile, noise, start, radius=radius, own=own)
 
 
 @one_blas_thread
@@ -162,12 +201,22 @@ def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
     radius, field, own = fit_radius(fwhm), scene.field, scene.drawn
     fitted = own.flux > 0
     clean = (flags == 0) & star_like(own.flux, fits.chi2, fitted, limit=MAX_CHI2)
-    broad, excess = judge_profiles(field, profile, noise, own, clean, fwhm, radius, subtracted=True)
+    shown = own.flux > _LEAST_SNR * np.sqrt(np.where(fitted, fits.covariance[:, 2, 2], np.inf))
+    judged = own._replace(flux=np.where(shown, own.flux, 0.0))
+    broad, excess = judge_profiles(
+        field, profile, noise, judged, clean, fwhm, radius, subtracted=True
+    )
     unsure = np.where(flags & FLAG_SATURATED, _SATURATED_ERROR, max(_LEAST_ERROR, noise.mismatch))
     all_light = own._replace(flux=np.where(fitted, own.flux, np.maximum(start.flux, 0)))
     alone = np.where(fitted[:, None, None], fits.covariance, np.nan)
     joint, shift = weigh_neighbors(
-        field, profile, noise, all_light, alone, radius, np.where(fitted, unsure, _NO_MODEL)
+        field,
+        profile,
+        noise.of_positions,
+        all_light,
+        alone,
+        radius,
+        np.where(fitted, unsure, _NO_MODEL),
     )
     before, after = (np.sqrt(c[:, 0, 0] + c[:, 1, 1]) for c in (alone, joint))
     error = np.hypot(after, shift)
