@@ -23,8 +23,9 @@ _FAIR_MISMATCH = 0.03
 _FINEST = 1.4
 # Share of broad stars that is not chance.
 _BROAD_SHARE = 0.04
-# Chi square of left-out stars, relative, from which a PSF is better than one with less freedom.
-_BETTER = 0.99
+# Chi square of left-out stars, relative, from which a PSF is better than one with less freedom: one
+# that varies in its blur, and one that leans as well.
+_BETTER_BLUR, _BETTER_LEAN = 0.99, 0.98
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
 
@@ -96,8 +97,8 @@ def learn_psf(field, stars, fwhm, gain, vary):
     ]
     log.debug("chi2 of left-out stars: constant PSF %.3f, varying blur %.3f, and lean %.3f", *chi2)
     # More freedom only where it brings something.
-    best = 1 if chi2[1] < _BETTER * chi2[0] else 0
-    best = 2 if chi2[2] < _BETTER * chi2[best] else best
+    best = 1 if chi2[1] < _BETTER_BLUR * chi2[0] else 0
+    best = 2 if chi2[2] < _BETTER_LEAN * chi2[best] else best
     if best == 0:
         return profile
     varying = vary_profile(field, noise, stars, profile, fwhm, **kinds[best - 1])

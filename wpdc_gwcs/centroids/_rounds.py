@@ -1,4 +1,4 @@
-"""Fits of all stars in turn, their neighbors' light taken off, and what the neighbors cost."""
+"""Fits of all stars, their neighbors' light taken off, and what the neighbors cost."""
 
 import logging
 from dataclasses import replace
@@ -96,7 +96,7 @@ def _with_asymmetry(noise, field, profile, stars, own, fwhm):
 
 @one_blas_thread
 def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
-    """Fit all stars in turn.
+    """Fit all stars, and improve those that share pixels together.
 
     Parameters
     ----------

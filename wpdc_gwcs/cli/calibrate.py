@@ -431,7 +431,7 @@ def print_changes(run):
         since = "" if last.get("first_epoch") is None else f" before {last['first_epoch']:.4f},"
         kept = ""
         if name in run.superseded:
-            from wpdc_gwcs.calibration.results import superseded_name
+            from wpdc_gwcs.calibration.names import superseded_name
 
             kept = f"; the old solution is in {superseded_name(run.superseded[name])}"
         typer.echo(

@@ -357,7 +357,7 @@ def _table_of_weights(compared):
 
 def _write_plots(frames, compared, folder, *, overwrite):
     from wpdc_gwcs import plotting
-    from wpdc_gwcs.calibration.results import file_stem
+    from wpdc_gwcs.calibration.names import file_stem
 
     figures = {}
     for frame in frames:

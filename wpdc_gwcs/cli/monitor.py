@@ -67,7 +67,7 @@ def monitor_command(
     a change that the fields of single exposures have absorbed is added back.  All detectors of a
     camera are tested, and --false-alarm is shared by all detectors and periods.
     """
-    from wpdc_gwcs.calibration.results import file_stem
+    from wpdc_gwcs.calibration.names import file_stem
     from wpdc_gwcs.io import write_table
 
     if plots is not None:
