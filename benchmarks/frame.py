@@ -30,10 +30,12 @@ from pathlib import Path
 
 FRAMES = {
     "csst": {"image_shape": (9232, 9216), "density": 124, "distortion": 200.0},
-    "cluster": {"image_shape": (9232, 9216), "density": 60, "distortion": 200.0, "cluster": 0.3},
+    "cluster": {"image_shape": (9232, 9216), "density": 42, "distortion": 200.0},
     "4096": {"image_shape": (4096, 4096), "density": 224, "distortion": 80.0},
     "2048": {"image_shape": (2048, 2048), "density": 224, "distortion": 40.0},
 }
+# Stars per square arcmin at the center of the cluster, its core and tidal radii in arcsec.
+CLUSTER = (600.0, 45.0, 300.0)
 SKY = {"galaxies": 20.0, "cosmic_rays": 400}
 SCALE = 0.074  # arcsec
 
@@ -47,9 +49,13 @@ def simulation_of(name, seed):
     from astropy import units as u
 
     from wpdc_gwcs import simulate
+    from wpdc_gwcs.simulation import KingCluster
 
     options = {"fwhm": 1.8, "psf_variation": 0.1, "slope": 0.2, "magnitudes": (17.0, 24.0)}
     options |= {"reference_limit": 21.5, "limit_snr": 12.0, "spurious": 0.0, "lost": 0.0}
+    if name == "cluster":
+        central, core, tidal = CLUSTER
+        options["cluster"] = KingCluster(central, core * u.arcsec, tidal * u.arcsec)
     return simulate(1, seed=seed, detector=name, pixel_scale=SCALE * u.arcsec,
                     **options, **FRAMES[name])  # fmt: skip
 
@@ -79,8 +85,12 @@ def run(frame, reference, output):
     # Where the command shows its progress.
     command.progress_bar = lambda **_: contextlib.nullcontext(hear)
     sys.argv = ["wpdc", "calibrate", frame, "--catalog", reference, "--output", output]
-    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(sys.stderr):
-        main()
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            main()
+    except SystemExit as end:
+        if end.code:
+            raise
     marks.append(("", time.process_time()))
     stages = {}
     for (stage, began), (_, ended) in itertools.pairwise(marks):
