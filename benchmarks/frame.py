@@ -16,6 +16,7 @@ SCAMP also without the laboratory's writer of its catalogs (``scamp.py`` under W
 """
 
 import argparse
+import contextlib
 import itertools
 import json
 import os
@@ -61,9 +62,13 @@ def make(name, seed, folder):
 
 
 def run(frame, reference, output):
-    """Calibrate a frame; prints the CPU seconds of its stages."""
-    from wpdc_gwcs import calibrate
-    from wpdc_gwcs.io import read_frames
+    """Calibrate a frame as the command does; prints the CPU seconds of its stages."""
+    from wpdc_gwcs.__main__ import main, prepare
+
+    prepare()
+    import wpdc_gwcs.io  # noqa: F401  What the command imports later would count as reading.
+    from wpdc_gwcs import calibrate  # noqa: F401
+    from wpdc_gwcs.cli import calibrate as command
 
     marks = [("import", 0.0), ("reading", time.process_time())]
 
@@ -71,7 +76,11 @@ def run(frame, reference, output):
         if total == 0:
             marks.append((stage, time.process_time()))
 
-    calibrate(read_frames(frame), reference, output=output, overwrite=True, progress=hear)
+    # Where the command shows its progress.
+    command.progress_bar = lambda **_: contextlib.nullcontext(hear)
+    sys.argv = ["wpdc", "calibrate", frame, "--catalog", reference, "--output", output]
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(sys.stderr):
+        main()
     marks.append(("", time.process_time()))
     stages = {}
     for (stage, began), (_, ended) in itertools.pairwise(marks):

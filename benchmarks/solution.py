@@ -114,7 +114,7 @@ def pulls(exposures, result, chosen):
     for e, fit, pick in zip(exposures, result.exposures, chosen):
         _, frame = calibration(fit, result)
         sigma_x, sigma_y, _ = frame.uncertainty(e.x, e.y)
-        # A star of the fit has drawn the map towards itself.
+        # A star of the fit has drawn the map toward itself.
         sign = np.where(fit.used, -1.0, 1.0)
         for residual, error, sigma in ((fit.dx, fit.x_err, sigma_x), (fit.dy, fit.y_err, sigma_y)):
             variance = error**2 + sign * sigma**2

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from astropy.table import Table
+from astropy.table import Table, vstack
 
 from wpdc_gwcs import Settings, calibrate, read
 from wpdc_gwcs.calibration import batches as batches_module
@@ -19,7 +19,7 @@ from wpdc_gwcs.calibration.manifest import read_manifest
 from wpdc_gwcs.calibration.results import ResultFolder
 from wpdc_gwcs.cli.app import run as command
 from wpdc_gwcs.cli.inputs import expand_paths
-from wpdc_gwcs.exceptions import InputError, without_frames
+from wpdc_gwcs.exceptions import CatalogError, InputError, without_frames
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.io import read_frames, read_table
 from wpdc_gwcs.simulation import simulate, write_simulation
@@ -295,3 +295,85 @@ class TestPaths:
                 (folder / name).write_bytes(text)
             with pytest.raises(InputError, match=message):
                 expand_paths([f"@{name}"])
+
+
+class Archive:
+    """A catalog that is given in parts, as an archive does."""
+
+    def __init__(self, path, identity="archive 1"):
+        self.table, self.identity, self.asked = Table.read(path), identity, []
+
+    def __str__(self):
+        return "archive"
+
+    def stars_of(self, region):
+        self.asked.append(len(region.ra))
+        return self.table[region.contains(self.table["ra"], self.table["dec"])]
+
+
+def test_a_run_with_an_archive_reads_what_each_batch_covers(inputs, pairs, tmp_path, monkeypatch):
+    frames, reference, stored, _ = inputs
+    archive = Archive(reference)
+    with monkeypatch.context() as patch:
+        stop_after(patch, 1)
+        with pytest.raises(Stopped):
+            calibrate(frames, archive, solution=stored, output=tmp_path)
+    assert archive.asked == [2, 2]
+    run = calibrate(frames, archive, solution=stored, output=tmp_path, resume=True)
+    assert run.resumed == tuple(f.name for f in frames[:2])
+    # What is done needs no stars.
+    assert archive.asked == [2, 2, 2, 2]
+    whole = calibrate(frames, reference, solution=stored)
+    np.testing.assert_array_equal(run.summary["rms_mas"], whole.summary["rms_mas"])
+    again = Archive(reference, "archive 2")
+    with pytest.raises(InputError, match="another catalog"):
+        calibrate(frames, again, solution=stored, output=tmp_path, resume=True)
+
+
+def test_an_archive_that_is_lost_ends_the_run_when_what_was_begun_is_done(inputs, pairs, tmp_path):
+    frames, reference, stored, _ = inputs
+
+    class Lost(Archive):
+        def stars_of(self, region):
+            if len(self.asked) == 2:
+                raise CatalogError("the archive does not answer")
+            return super().stars_of(region)
+
+    with (
+        ThreadPoolExecutor(2) as pool,
+        pytest.raises(CatalogError, match="does not answer"),
+    ):
+        calibrate(frames, Lost(reference), solution=stored, output=tmp_path, executor=pool)
+    assert len(read_table(tmp_path / "summary.ecsv")) == 4
+    run = calibrate(frames, Archive(reference), solution=stored, output=tmp_path, resume=True)
+    assert len(run.resumed) == 4
+    assert list(run.summary["status"]) == ["solved"] * 6
+
+
+def test_resume_with_a_file_of_which_a_part_is_read(inputs, tmp_path, monkeypatch):
+    frames, reference, *_ = inputs
+    monkeypatch.setattr("wpdc_gwcs.catalogs.pieces._LARGE", 0)
+    # Half of the stars are elsewhere.
+    table = Table.read(reference)
+    far = table.copy()
+    far["dec"] = -far["dec"]
+    path = tmp_path / "all.fits"
+    vstack([table, far]).write(path)
+    two = [replace(f, detector=d) for f, d in zip(frames[:4], "aabb", strict=True)]
+    with monkeypatch.context() as patch:
+        stop_after(patch, 1)
+        with pytest.raises(Stopped):
+            calibrate(two, path, output=tmp_path / "out")
+    manifest = read_manifest(tmp_path / "out/manifest.json")
+    assert set(manifest.catalog) == {"part_of"}
+    run = calibrate(two, path, output=tmp_path / "out", resume=True)
+    assert run.resumed == tuple(f.name for f in two[:2])
+    whole = calibrate(two, reference)
+    for name in ("rms_mas", "n_matched"):
+        np.testing.assert_array_equal(run.summary[name], whole.summary[name])
+    # The part of other frames is of the same catalog; another file is another one.
+    more = [*two, *(replace(f, detector="c") for f in frames[4:])]
+    assert len(calibrate(more, path, output=tmp_path / "out", resume=True).resumed) == 4
+    os.utime(path, (1, 1))
+    with pytest.raises(InputError, match="another catalog"):
+        calibrate(two, path, output=tmp_path / "out", resume=True)

@@ -72,7 +72,9 @@ def test_what_is_no_file_is_refused_at_once(inputs, monkeypatch, capsys, role, k
     (line,) = [one for one in said.splitlines() if one.startswith("wpdc: error: ")]
     assert "odd.fits" in line
     what = {"folder": "a folder", "pipe": "a pipe", "socket": "a socket", "device": "a device"}
-    if kind in what and role not in ("--solution", ""):
+    if (kind, role) == ("folder", "frame"):
+        assert "the folder has no FITS file and no FITS_LDAC list" in line
+    elif kind in what and role not in ("--solution", ""):
         assert f"must be a file, is {what[kind]}" in line
 
 

@@ -1,4 +1,4 @@
-"""A camera: where its detectors stand in the focal plane, and the solution of each.
+"""A camera: the positions of its detectors in the focal plane, and the solution of each.
 
 ::
 
@@ -38,7 +38,7 @@ class Camera:
     cd : (2, 2) ndarray
         Nominal matrix of the reference, deg / px.
     learned : dict
-        Standard deviations (px) of the terms of the model, as the stars told them.
+        Standard deviations (px) of the terms of the model, estimated from the stars.
     files : dict
         Detector to the file of its solution, relative to that of the camera.
     solutions : dict

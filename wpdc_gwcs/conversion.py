@@ -1,4 +1,4 @@
-"""Any WCS of an image in the form of this package: polynomial and look-up table, fitted to it.
+"""Conversion of any WCS of an image: a polynomial and a look-up table are fitted to it.
 
 ::
 

@@ -1,9 +1,8 @@
 """Errors and warnings of wpdc_gwcs.
 
-Every error that a caller may want to catch derives from `WPDCError`.  Two families matter to
-pipelines: input that cannot be used at all (`InputError`; the command line answers with exit status
-2), and a frame that was read but could not be solved (`FrameFailure`; exit status 1, the other
-frames go on).
+Every error that a caller may want to catch derives from `WPDCError`.  There are two kinds: input
+that cannot be used at all (`InputError`; exit status 2 on the command line), and a frame that was
+read but could not be solved (`FrameFailure`; exit status 1, the other frames are not affected).
 """
 
 from astropy.utils.exceptions import AstropyUserWarning
@@ -52,7 +51,7 @@ class FileFormatError(InputError):
 
 
 class ClusterError(InputError):
-    """A cluster that was to do the work, and has no scheduler or no worker."""
+    """A cluster that has no scheduler or no worker."""
 
 
 class FrameFailure(WPDCError):
@@ -97,14 +96,14 @@ class FitError(FrameFailure):
 
 
 class InternalError(FrameFailure):
-    """What should not happen to a frame: a mistake of the program, or a process that died.
+    """An unexpected error: a bug of the program, or a process that died.
 
     Parameters
     ----------
     message : str
         What is wrong, in one line.
     details : str, optional
-        Where it happened, for those who mend it.
+        Where it happened, for bug reports.
     """
 
     def __init__(self, message="", details=""):
@@ -124,7 +123,7 @@ class CentroidWarning(WPDCWarning):
 
 
 def without_frames(error):
-    """Let an error that is kept forget where it was raised.
+    """Remove the tracebacks from an error that is kept.
 
     Parameters
     ----------

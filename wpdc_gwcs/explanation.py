@@ -55,7 +55,7 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What became of a frame, and why.
+    """The result for a frame, stage by stage, with reasons.
 
     Parameters
     ----------
@@ -64,9 +64,9 @@ class Explanation:
     status : str
         ``solved``, ``degraded`` or ``failed``.
     reasons : tuple of str
-        What it lacks, or the error.
+        Its limitations, or the error.
     stages : tuple of Stage
-        As far as it came.
+        The stages that were reached.
     advice : tuple of str
         What to try next.
     sources : `~astropy.table.Table` or None
@@ -116,7 +116,7 @@ class _Story:
 
 
 def explain_frame(frame, catalog, settings=None):
-    """Go through a frame stage by stage, and tell what was found and what to try.
+    """Go through a frame stage by stage, and describe the results and what to try.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def explain_frame(frame, catalog, settings=None):
     Returns
     -------
     Explanation
-        Whatever becomes of the frame; it is solved by itself, without others of its camera.
+        Also if the frame fails; it is solved by itself, without others of its camera.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A frame: what one exposure of one detector brings to a calibration."""
+"""A frame: one exposure of one detector, as input of a calibration."""
 
 import math
 import re
@@ -42,8 +42,8 @@ class Frame:
     read_noise : float, optional
         Of the detector, in electrons, from the header: the least that the noise of a pixel can be.
     exposure : str, optional
-        What tells the exposure from others of its camera: frames with the same camera and exposure
-        were taken at once by the detectors of a mosaic.  `None`: the frame is on its own.
+        Identifies the exposure among those of its camera: frames with the same camera and exposure
+        were taken at the same time by the detectors of a mosaic.  `None`: a frame on its own.
     camera : str, optional
         Name of the camera, whose detectors share a focal plane; `None`: the detector is on its own.
     meta : dict

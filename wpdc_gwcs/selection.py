@@ -162,7 +162,7 @@ def _roundness_difference(x, y, roundness, snr, clean):
         return roundness - (np.median(roundness[rows]) if len(rows) > 2 else 0.0), 0.0
     typical = np.full(len(x), _crowded_half(roundness[rows])[0])
     if len(rows) >= _MIN_LOCAL:
-        # Those that another rule leaves out need no judgement by this one.
+        # Those that another rule leaves out need no judgment by this one.
         placed = np.flatnonzero(clean & np.isfinite(x) & np.isfinite(y))
         tree = KDTree(np.column_stack([x[rows], y[rows]]))
         _, near = tree.query(np.column_stack([x[placed], y[placed]]), k=_NEIGHBORS)

@@ -12,7 +12,7 @@ __all__ = [
 
 
 def directions(ra, dec):
-    """Give unit vectors towards stars, East and North of them.
+    """Give unit vectors toward stars, East and North of them.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ _MOST_CONDITION = 1e6
 
 
 def has_inverse(matrix):
-    """Tell whether a matrix is finite and has an inverse worth having.
+    """Return whether a matrix is finite and has a useful inverse.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def _freeze_sigma(owner, name):
 
 @dataclass(frozen=True, eq=False)
 class DistortionSolution(InMemory):
-    """The distortion of one detector: what all its exposures share.
+    """The distortion of one detector, which all its exposures share.
 
     Parameters
     ----------
@@ -74,24 +74,24 @@ class DistortionSolution(InMemory):
     crpix : (2,) ndarray
         Reference point, px, zero based.
     cd : (2, 2) ndarray
-        Nominal matrix CD0 in which the PV polynomial stands, deg / px.
+        Nominal matrix CD0 used by the PV polynomial, deg / px.
     crval : (2,) ndarray
         Nominal pointing, deg.
     pv : PVPolynomial
         Polynomial without constant and with unit linear terms.
     lookup_table : LookupTable, optional
-        What the polynomial leaves.
+        Table of the residuals of the polynomial.
     table_sigma : (3, n, n) ndarray, optional
         sigma_x, sigma_y in px and their correlation on a grid from one outer edge of the detector
         to the other, of polynomial and table together, without the linear part that the attitudes
         carry.
     residual_map : ResidualMap, optional
-        Binned residuals behind the table, to which those of other frames can be added.
+        Binned residuals of the table, to which those of other frames can be added.
     statistics, settings, provenance : dict
-        How the solution came about; they cannot be changed, nor what is in them.
+        How the solution was made; they and their contents cannot be changed.
     valid_from, valid_to : float, optional
-        Epochs, Julian years, from which on and before which the solution holds; `None` for no limit
-        that is known.
+        Epochs (Julian years) from which, and until which, the solution is valid; `None` if there is
+        no known limit.
     """
 
     detector: str
@@ -140,12 +140,12 @@ class DistortionSolution(InMemory):
         return as_html(self)
 
     def holds_at(self, epoch):
-        """Tell whether the solution is valid at an epoch.
+        """Return whether the solution is valid at an epoch.
 
         Parameters
         ----------
         epoch : float or None
-            Julian year; unknown epochs are let pass.
+            Julian year; an unknown epoch counts as valid.
 
         Returns
         -------
@@ -169,7 +169,7 @@ class DistortionSolution(InMemory):
 
     @cached_property
     def wcs(self):
-        """WCS about the nominal pointing, `gwcs.WCS`."""
+        """WCS with the nominal pointing, `gwcs.WCS`."""
         return build_wcs(
             crpix=self.crpix,
             cd=self.cd,
@@ -190,7 +190,7 @@ class DistortionSolution(InMemory):
         Returns
         -------
         x, y : ndarray
-            Undistorted pixels; they go on off the detector.
+            Undistorted pixels; also defined off the detector.
         """
         return self.wcs.get_transform("detector", "undistorted")(x, y)
 
@@ -206,7 +206,7 @@ class DistortionSolution(InMemory):
         return float(area.min()), float(area.max())
 
     def covariance(self, x, y):
-        """Covariance of the distortion that the instrument predicts, apart from its linear part.
+        """Covariance of the distortion of the detector, without its linear part.
 
         Parameters
         ----------
@@ -284,11 +284,11 @@ class Calibration(InMemory):
         Displacement of stars per magnitude of color in undistorted px: dX = c0 + cx X + cy Y for
         each axis, with X, Y in px from the reference point.
     reference_color : float, optional
-        Color that the WCS is for, mag.
+        Color for which the WCS is valid, mag.
     matches, sources : `~astropy.table.Table`, optional
         Pairs and sources of the frame, with units.
     statistics, settings, provenance : dict
-        How the calibration came about; they cannot be changed, nor what is in them.
+        How the calibration was made; they and their contents cannot be changed.
     """
 
     frame: str
@@ -353,7 +353,7 @@ class Calibration(InMemory):
         return forward.block_function(box=box), forward.inverse.block_function(box=box)
 
     def pixel_to_sky(self, x, y):
-        """Map detector pixels to the sky: ``wcs(x, y)`` without what every call of it must check.
+        """Map detector pixels to the sky: a faster ``wcs(x, y)`` for a few points.
 
         Parameters
         ----------
@@ -372,7 +372,7 @@ class Calibration(InMemory):
         return _evaluate(self._functions[0], x, y, u.pix)
 
     def sky_to_pixel(self, ra, dec):
-        """Map the sky to detector pixels: ``wcs.invert(ra, dec)`` without its checks.
+        """Map the sky to detector pixels: a faster ``wcs.invert(ra, dec)`` for a few points.
 
         Parameters
         ----------
@@ -407,7 +407,7 @@ class Calibration(InMemory):
         )
 
     def undistort(self, x, y):
-        """Take distortion and field off detector pixels.
+        """Remove distortion and field from detector pixels.
 
         Parameters
         ----------
@@ -417,7 +417,7 @@ class Calibration(InMemory):
         Returns
         -------
         x, y : ndarray
-            Undistorted pixels; they go on off the detector.
+            Undistorted pixels; also defined off the detector.
         """
         return self.wcs.get_transform("detector", "undistorted")(x, y)
 
@@ -432,7 +432,7 @@ class Calibration(InMemory):
         Returns
         -------
         Calibration
-            With another CRVAL and CD; the same where the frame shows nothing that goes with color.
+            With another CRVAL and CD; the same if the frame shows no dependence on color.
 
         Raises
         ------
@@ -453,7 +453,7 @@ class Calibration(InMemory):
         )
 
     def uncertainty(self, x, y):
-        """Uncertainty of the calibrated position of a detector position, without centroid errors.
+        """Uncertainty of the WCS at a detector position, without centroid errors.
 
         Parameters
         ----------
@@ -470,9 +470,9 @@ class Calibration(InMemory):
 
         Notes
         -----
-        Posterior covariance of all terms: polynomial or table, attitude and field of the exposure,
-        each of them wide where no star tells.  Times the scale of the detector, it is the
-        uncertainty on the sky.
+        This is the posterior covariance of all terms: polynomial or table, attitude and field of
+        the exposure.  It is large where there are no stars.  Multiply it by the pixel scale to get
+        the uncertainty on the sky.
         """
         x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
         total = _covariance(self.sigma, self.solution.image_shape, x, y)

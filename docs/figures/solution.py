@@ -112,7 +112,7 @@ def total(values):
 
 
 def draw_degrees():
-    """Learnt standard deviations of the degrees of one exposure, against the true ones."""
+    """Learned standard deviations of the degrees of one exposure, against the true ones."""
     sky, (full,), _ = make(1, 20.0, 1, waves=0.0)
     degrees = np.arange(2, 8)
     figure = Figure(figsize=(6.0, 3.9), layout="constrained")
@@ -124,7 +124,7 @@ def draw_degrees():
     for n, color, style in ((30, ORANGE, "^--"), (100, GREEN, "s-."), (len(full.x), BLUE, "o-")):
         keep = np.sort(rng.permutation(len(full.x))[:n])
         sizes = solve([select(full, keep)]).solution.statistics["learned"]["polynomial"]
-        axes.plot(degrees, sizes, style, color=color, ms=5, label=f"learnt from {n} stars")
+        axes.plot(degrees, sizes, style, color=color, ms=5, label=f"learned from {n} stars")
         print(f"{n} stars: {np.round(sizes, 3)}")
     axes.set_yscale("log")
     axes.set_ylim(1e-3, 30)

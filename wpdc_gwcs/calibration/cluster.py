@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 
 # How often workers are counted, s.
 _PERIOD = 0.5
+# For so long, s, a client has no answer where its machine is busy: nothing to speak of.
+_BUSY = 10.0
 _GO_ON = "what is done is kept: go on with --resume (resume=True)"
 
 
@@ -136,20 +138,25 @@ class _WatchedExecutor(Executor):
 
     def _watch(self):
         """Done by a thread: count the workers, and give up when there are none for too long."""
-        since = None
+        since, said = None, False
         while not self._ended.wait(_PERIOD):
             if self._has_workers():
-                since = None
-            elif since is None:
-                since = time.monotonic()
-                log.warning(
-                    "%s: all workers of the Dask scheduler are gone; waiting at most %g s",
-                    self._address,
-                    self._timeout,
-                )
-            elif time.monotonic() - since > self._timeout:
+                since, said = None, False
+                continue
+            since = time.monotonic() if since is None else since
+            waited = time.monotonic() - since
+            if waited > self._timeout:
                 self._give_up()
                 return
+            if waited > _BUSY and not said:
+                said = True
+                log.warning(
+                    "%s: no worker of the Dask scheduler is to be seen for %.0f s; waiting at most "
+                    "%g s",
+                    self._address,
+                    waited,
+                    self._timeout,
+                )
 
     def _has_workers(self):
         try:

@@ -86,7 +86,7 @@ def solve_free_stars(exposures, result, solve):
     .. math:: d_i = \sum_{j \ne i} w_j o_j / (\sum_{j \ne i} w_j + 1 / \sigma_c^2) ,
 
     with the error of this mean, so that no pair is held against itself; then comes the solution,
-    then the offsets again.  Scales of the errors of both sides are learnt from the scatter of the
+    then the offsets again.  Scales of the errors of both sides are learned from the scatter of the
     pairs of each star and from that of their means.
 
     References

@@ -9,8 +9,8 @@
 The header's geometry is common to all exposures of a camera, up to a linear mapping.  What it lacks
 is a polynomial of the focal plane (the optics), three numbers per axis for each detector (its
 place) and three per axis for each exposure (pointing, rotation, scale).  All of them are found
-together from the matched frames, each with a Gaussian prior whose width is learnt from the data, so
-that a prediction has an error: small between matched detectors, growing outward.
+together from the matched frames, each with a Gaussian prior whose width is learned from the data,
+so that a prediction has an error: small between matched detectors, growing outward.
 """
 
 from dataclasses import dataclass
@@ -111,7 +111,7 @@ class Geometry:
     places : dict
         Detector to the coefficients (3, 2) of its place, px.
     widths : Widths
-        Priors as learnt.
+        Priors as learned.
     deviations : dict
         Matched frame to how far it is from where the others predict it: (sigma, px).
     covariance : (n, n) ndarray

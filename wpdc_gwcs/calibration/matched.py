@@ -65,6 +65,7 @@ class MatchedFrame:
     exposure: str | None = None  # as in `Frame`: with others of the camera, or on its own
     camera: str | None = None
     epoch: float | None = None
+    left_out: str | None = None  # how many sources each rule has left out, where that was counted
 
     @property
     def n_sources(self):
@@ -118,7 +119,9 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
         sources = measure_sources(frame, settings)
     announce("matching")
     sources = with_errors(sources)
-    usable = usable_sources(sources, frame, settings)
+    rules = rules_of(sources, frame, settings)
+    usable = ~np.any(list(rules.values()), axis=0)
+    counts = left_out(rules)
     x, y = np.asarray(sources["x"], float), np.asarray(sources["y"], float)
     start = _start(frame, solution)
     if solution is None:
@@ -142,7 +145,6 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
             blind=settings.blind,
         )
     except MatchError as err:
-        counts = left_out(rules_of(sources, frame, settings))
         raise MatchError(f"{err} ({counts})", found=err.found) from err
     return MatchedFrame(
         name=frame.name,
@@ -161,6 +163,7 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
         exposure=frame.exposure,
         camera=frame.camera,
         epoch=frame.epoch,
+        left_out=counts,
     )
 
 

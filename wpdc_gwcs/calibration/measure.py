@@ -147,7 +147,7 @@ def measure_sources(frame, settings=None):
     return sources[bright]
 
 
-def quality_of(frame, sources, settings):
+def quality_of(frame, sources, settings, *, counts=None):
     """Tell what a frame is like: its PSF and noise, and how many sources each rule leaves out.
 
     Parameters
@@ -158,6 +158,8 @@ def quality_of(frame, sources, settings):
         As from `measure_sources`.
     settings : Settings
         ``max_roundness`` and ``min_snr`` are used.
+    counts : str, optional
+        What `wpdc_gwcs.selection.left_out` has told of the sources, where it was asked before.
 
     Returns
     -------
@@ -171,8 +173,9 @@ def quality_of(frame, sources, settings):
     for name in ("fwhm", "ellipticity", "mismatch", "gain", "noise"):
         value = meta.get(name)
         result[name] = float(value) if isinstance(value, int | float) else np.nan
-    result["left_out"] = "" if sources is None else left_out(rules_of(sources, frame, settings))
-    return result
+    if counts is None:
+        counts = "" if sources is None else left_out(rules_of(sources, frame, settings))
+    return result | {"left_out": counts}
 
 
 def rules_of(sources, frame, settings):

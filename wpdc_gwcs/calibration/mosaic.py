@@ -135,7 +135,7 @@ def _solve(plane, results, catalog, settings, solution):
         if wrong is not None:
             doubted[wrong] = matched.pop(wrong)
             failed[wrong] = doubted[wrong]
-            # what was learnt with it in the wrong place is to be learnt anew
+            # what was learned with it in the wrong place is to be learned anew
             geometry = None
             continue
         new = {}

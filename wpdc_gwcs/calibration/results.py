@@ -12,6 +12,7 @@ from astropy.table import Table
 
 from wpdc_gwcs.calibration.journal import find_journals, read_journal, write_entry
 from wpdc_gwcs.calibration.manifest import files_of, read_manifest
+from wpdc_gwcs.calibration.names import check_distinct, file_stem, names_of, superseded_name
 from wpdc_gwcs.calibration.staging import (
     FRAME_SUFFIXES,
     MANIFEST,
@@ -24,7 +25,7 @@ from wpdc_gwcs.calibration.staging import (
 from wpdc_gwcs.calibration.summary import summarize
 from wpdc_gwcs.exceptions import InputError
 
-__all__ = ["ERRORS", "Outcome", "ResultFolder", "file_stem", "superseded_name"]
+__all__ = ["ERRORS", "Outcome", "ResultFolder"]
 
 #: Where the details of internal errors are.
 ERRORS = "errors.log"
@@ -33,38 +34,6 @@ ERRORS = "errors.log"
 _SHARE = 0.1
 # More detectors than any camera has.
 _ALL = 1 << 30
-
-
-def file_stem(name):
-    """Make a file name of the name of a detector or camera, whatever characters it has.
-
-    Parameters
-    ----------
-    name : str
-        Name of the detector.
-
-    Returns
-    -------
-    str
-        Name without characters that a file system may refuse.
-    """
-    return "".join(c if c.isalnum() or c in "._-" else "_" for c in name)
-
-
-def superseded_name(solution):
-    """Name of the file of a solution that no longer holds.
-
-    Parameters
-    ----------
-    solution : DistortionSolution
-        With the epoch until which it was valid.
-
-    Returns
-    -------
-    str
-        Such as ``ccd1.until-2024.5000.solution.asdf``.
-    """
-    return f"{file_stem(solution.detector)}.until-{solution.valid_to:.4f}.solution.asdf"
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +168,8 @@ class ResultFolder:
         """
         cameras = {}
         for group in groups:
-            self._names[group[0].name] = _names_of(group, cameras)
-        _check_distinct(self._names.values())
+            self._names[group[0].name] = names_of(group, cameras)
+        check_distinct(self._names.values())
         frames = [frame for group in groups for frame in group]
         files = [*inputs, *(file for frame in frames for file in files_of(frame))]
         self._inputs = {os.path.realpath(file) for file in files}
@@ -495,46 +464,6 @@ class ResultFolder:
         with path.open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{self._manifest.run} {name}: {error}\n{error.details}\n")
         return path
-
-
-def _names_of(group, cameras):
-    """Files that a group of frames may write, and what each is of."""
-    names = {
-        frame.name + suffix: frame.source or frame.name
-        for frame in group
-        for suffix in reversed(FRAME_SUFFIXES)
-    }
-    detectors = {frame.detector for frame in group}
-    for detector in detectors:
-        names[f"{file_stem(detector)}.solution.asdf"] = f"detector {detector!r}"
-    if len(names) < len(FRAME_SUFFIXES) * len(group) + len(detectors):
-        raise InputError(
-            f"detectors must have different names in files, got {', '.join(sorted(detectors))}"
-        )
-    if len(detectors) > 1:
-        camera = next((frame.camera for frame in group if frame.camera), "camera")
-        # Exposures that have no detector in common are solved apart.
-        apart = cameras.setdefault(camera, [])
-        k = next((k for k, known in enumerate(apart) if known & detectors), len(apart))
-        if k == len(apart):
-            apart.append(set())
-        apart[k] |= detectors
-        mark = f"-{k + 1}" if k else ""
-        names[f"{file_stem(camera)}{mark}.camera.asdf"] = f"camera {camera!r}{mark}"
-    return names
-
-
-def _check_distinct(names):
-    owners = {}
-    for files in names:
-        for name, owner in files.items():
-            # Detectors of one name have one stored solution.
-            if name in owners and owners[name] != owner:
-                raise InputError(
-                    f"{owners[name]} and {owner} would both write {name}: calibrate them into "
-                    "different folders"
-                )
-            owners[name] = owner
 
 
 def _of_run(result, run):

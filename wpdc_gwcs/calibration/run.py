@@ -5,34 +5,33 @@ import logging
 import os
 import time
 import uuid
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
-from astropy.table import QTable, Table
+from astropy.table import QTable
 
 from wpdc_gwcs.calibration.batches import batches_of
 from wpdc_gwcs.calibration.camera import cameras_of, solve_camera
 from wpdc_gwcs.calibration.exposures import tie_exposures
 from wpdc_gwcs.calibration.manifest import plan_run
-from wpdc_gwcs.calibration.matched import FailedFrame, sky_of_frame
-from wpdc_gwcs.calibration.mosaic import start_from_neighbors
+from wpdc_gwcs.calibration.matched import FailedFrame
 from wpdc_gwcs.calibration.results import Outcome, ResultFolder
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.story import (
+    say,
     tell_catalog,
     tell_frames,
     tell_outcome,
     tell_result,
 )
 from wpdc_gwcs.calibration.summary import summarize, summary_row
-from wpdc_gwcs.calibration.workers import Task, Workers, internal_error, stored_of
+from wpdc_gwcs.calibration.work import Run, begin_group, match_group, sky_of_frames
+from wpdc_gwcs.calibration.workers import Workers, internal_error, stored_of
 from wpdc_gwcs.camera import build_camera
 from wpdc_gwcs.catalogs import (
-    Region,
     catalog_source,
     fill_motions,
     read_catalog,
@@ -44,7 +43,6 @@ from wpdc_gwcs.exceptions import (
     DuplicateFrameError,
     FitError,
     InternalError,
-    MatchError,
     WPDCError,
     without_frames,
 )
@@ -60,13 +58,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class CalibrationRun:
-    """Everything a call of `calibrate` found.
+    """The results of a call of `calibrate`.
 
     Parameters
     ----------
     calibrations : tuple of `Calibration`
-        One for each solved frame, in the order of the input; none of a run that leaves them to
-        its files.
+        One for each solved frame, in the order of the input; empty if they are only written to
+        files.
     solutions : dict
         Detector name to `DistortionSolution`.
     failures : dict
@@ -74,11 +72,11 @@ class CalibrationRun:
     summary : `~astropy.table.QTable`
         One row per frame: status, reason, counts, residual statistics, seconds.
     superseded : dict
-        Detector name to the stored solution that an update has found changed, valid until then.
+        Detector name to the stored solution, valid until then, of a detector that has changed.
     cameras : tuple of `Camera`
         One for each group of detectors that were solved together.
     run_id : str
-        Identity of the run, which all files carry that it writes.
+        Identifier of the run, which is in all its files.
     resumed : tuple of str
         Frames that an earlier run had done, whose results were read from its files.
     """
@@ -125,34 +123,34 @@ def calibrate(
     frames : Frame or iterable of Frame
         What `wpdc_gwcs.io.read_frames` returns; names must be unique.
     catalog : path-like, Table, SkyCoord, GaiaArchive or HatsCatalog
-        Reference catalog: whatever `read_catalog` takes, and what it returned; of ``"gaia"``,
-        ``"hats:PATH"`` and large files, the part about the frames is read.
+        Reference catalog: anything that `read_catalog` accepts or returns.  Of ``"gaia"``,
+        ``"hats:PATH"`` and large files, only the part around the frames is read.
     solution : DistortionSolution, Camera or mapping, optional
-        Stored solution (of a camera, or detector name to solution): its distortion is kept; each
-        frame gets its attitude, and a field where its stars speak for one.
+        Stored solution (of a camera, or detector name to solution).  Its distortion is kept; the
+        attitude of each frame is fitted, and a field if there is evidence for one.
     update : bool, optional
-        Merge the new frames into the stored solution, and let it follow a change, instead of
-        keeping it fixed.
+        Merge the new frames into the stored solution, and adapt it if the detector has changed,
+        instead of keeping it fixed.
     settings : Settings, optional
-        Choices; the defaults work for any camera.
+        Options; the defaults work for any camera.
     jobs : int, optional
         Processes in which frames are measured and matched.
     executor : concurrent.futures.Executor, optional
         Where frames are measured and matched instead, for example
-        ``dask.distributed.Client(...).get_executor()``.  With each frame goes the part of the
-        catalog that it can need, and no more.
+        ``dask.distributed.Client(...).get_executor()``.  Each frame is sent with the part of the
+        catalog that it needs.
     output : path-like, optional
         Folder into which all results are written, made if needed; those of a detector as soon as
         it is solved.
     overwrite : bool, optional
-        Replace files that are there.
+        Replace existing files.
     resume : bool, optional
-        Leave out what a run of the same frames, catalog, settings and versions has written into
-        the folder already, and go on with it.  What is there of other frames stays, with its rows
-        of the summary: a survey may grow night by night.
+        Continue a run in the folder: skip frames that are already done with the same catalog,
+        settings and versions.  Results of other frames are kept, with their rows of the summary,
+        so a survey can grow night by night.
     keep : bool, optional
-        Whether all calibrations are returned.  `False` leaves them to the files of ``output``, and
-        needs memory for the frames that are in work, however many there are.
+        Whether all calibrations are returned.  With `False` they are only written to ``output``,
+        and memory is needed only for the frames in work, however many there are.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` while the run goes on; for the stages of one
         frame, which have no number, as ``progress(stage, 0, 0)``.
@@ -167,25 +165,25 @@ def calibrate(
     DuplicateFrameError
         If two frames have the same name.
     TypeError
-        If what is given is no frame, for example the path of one.
+        If an argument is not a frame, for example if it is a path.
     ValueError
         If there is no frame, or ``update`` is asked for with ``method="paper"``.
     InputError
         If the catalog cannot be used, a file cannot be written or may not be replaced, or a run
-        of other choices is to be resumed.
+        with different settings is to be resumed.
     ClusterError
-        If the executor has nobody left to do the work; what was done is written.
+        If the executor has no workers left; results so far are written.
 
     Warns
     -----
     WPDCWarning
-        If frames that are said to be of one exposure cannot be, see `tie_exposures`.
+        If frames cannot belong to one exposure as their headers claim, see `tie_exposures`.
 
     Notes
     -----
-    All frames of a camera are solved together, and wait for each other in memory.  With a stored
-    ``solution`` that covers all its detectors and is not updated, they come in batches of 16
-    exposures: results are written batch by batch.
+    All frames of a camera are solved together and are kept in memory until then.  With a stored
+    ``solution`` that covers all its detectors and is not updated, they are solved and written in
+    batches of 16 exposures.
 
     References
     ----------
@@ -215,7 +213,7 @@ def calibrate(
             update=update,
             earlier=() if folder is None else folder.earlier_groups(),
         )
-        _say(tell_frames, frames, groups)
+        say(tell_frames, frames, groups)
         catalog = catalog_source(catalog, max_mag=settings.max_mag)
         path = catalog if isinstance(catalog, str | os.PathLike) else None
         # Before the catalog, which may take a while.
@@ -223,10 +221,10 @@ def calibrate(
             folder.check(groups, inputs=[] if path is None else [split_extension(path)[0]])
         if not hasattr(catalog, "stars_of"):
             # What is in memory is there as a whole; of a file all that the run needs, once.
-            region = None if path is None else _sky_of(frames, settings, solution)
+            region = None if path is None else sky_of_frames(frames, settings, solution)
             began = time.perf_counter()
             catalog = fill_motions(read_catalog(catalog, region=region))
-            _say(tell_catalog, catalog, time.perf_counter() - began)
+            say(tell_catalog, catalog, time.perf_counter() - began)
         run_id = uuid.uuid4().hex[:12]
         if folder is not None:
             plan = plan_run(
@@ -239,7 +237,7 @@ def calibrate(
                 update=update,
             )
             run_id = folder.begin(groups, plan).run
-        run = _Run(frames, catalog, solution, settings, update, progress)
+        run = Run(frames, catalog, solution, settings, update, progress)
         done = [group for group in groups if folder is not None and folder.is_done(group)]
         outcomes = {group[0].name: folder.load(group, keep=keep) for group in done}
         todo = [group for group in groups if group[0].name not in outcomes]
@@ -259,16 +257,6 @@ def calibrate(
                     )  # fmt: skip
     resumed = tuple(frame.name for group in done for frame in group)
     return _joined(frames, list(outcomes.values()), run_id, resumed)
-
-
-def _sky_of(frames, settings, solution):
-    """Sky that the frames of a run cover; `None` where none of them tells."""
-    cones = [
-        sky_of_frame(frame, settings, solution=stored_of(solution, frame.detector))
-        for frame in frames
-    ]
-    cones = [cone for cone in cones if cone is not None]
-    return Region(*zip(*cones, strict=True)) if cones else None
 
 
 def _as_frames(frames):
@@ -291,42 +279,6 @@ def _as_frames(frames):
     return frames
 
 
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """What all frames of a run share."""
-
-    frames: list
-    catalog: object
-    solution: object
-    settings: Settings
-    update: bool
-    progress: Callable
-
-    def catalog_of(self, group):
-        """Give the reference stars of frames that are solved together."""
-        if not hasattr(self.catalog, "stars_of"):
-            # Of all frames, its motions filled from the whole: a star moves alike in all of them.
-            return self.catalog
-        sky = _sky_of(group, self.settings, self.solution)
-        if sky is None:
-            # They fail by themselves, whatever the catalog.
-            cones = (_sky_of([f], self.settings, self.solution) for f in self.frames)
-            sky = next((cone for cone in cones if cone is not None), None)
-        began = time.perf_counter()
-        part = fill_motions(read_catalog(self.catalog, region=sky))
-        _say(tell_catalog, part, time.perf_counter() - began)
-        return part
-
-
-@dataclass(eq=False)
-class _InWork:
-    """Frames that are solved together, their part of the catalog, and what matches them."""
-
-    group: list
-    catalog: Table
-    tasks: dict
-
-
 def _outcomes(groups, run, workers):
     """Yield each group and what is found of it; those behind it are matched in the meantime.
 
@@ -346,7 +298,7 @@ def _outcomes(groups, run, workers):
             if begun and in_hand >= workers.in_hand:
                 break
             try:
-                begun.append(_begin(waiting.popleft(), run, workers, other))
+                begun.append(begin_group(waiting.popleft(), run, workers, other))
             except (CatalogError, ClusterError) as err:
                 lost = err
 
@@ -360,14 +312,14 @@ def _outcomes(groups, run, workers):
             results = {name: other[name] for name in frames} if other else {}
             for name in list(work.tasks):
                 results[name] = work.tasks.pop(name)()
-                _say(tell_result, frames[name], results[name], run.settings)
+                say(tell_result, frames[name], results[name], run.settings)
                 run.progress("match", next(counter), n_frames)
                 begin()
             run.progress("solve", k, len(groups))
             announce("solution")
             began = time.perf_counter()
             outcome = _outcome_of(work, results, run, None if other else workers)
-            _say(tell_outcome, outcome, time.perf_counter() - began)
+            say(tell_outcome, outcome, time.perf_counter() - began)
         except ClusterError as err:
             lost = lost or err
             continue
@@ -379,27 +331,12 @@ def _outcomes(groups, run, workers):
     run.progress("solve", len(groups), len(groups))
 
 
-def _say(tell, *what):
-    """Log the lines of a stage, which nobody makes where nobody reads them."""
-    if log.isEnabledFor(logging.INFO):
-        for line in tell(*what):
-            log.info("%s", line)
-
-
-def _begin(group, run, workers, other):
-    """Have the frames of a group matched."""
-    if other:
-        return _InWork(group, None, {})
-    catalog = run.catalog_of(group)
-    return _InWork(group, catalog, _submit(group, catalog, run, workers, narrow=True))
-
-
 def _outcome_of(work, results, run, workers):
     """Match what could not be matched alone, where there are workers for it, and solve."""
     group = work.group
     try:
         if workers is not None:
-            results = _match_group(work, results, run, workers)
+            results = match_group(work, results, run, workers)
         return _solve_group(work, results, run)
     except ClusterError:
         raise
@@ -524,60 +461,6 @@ def _camera_of(group, solutions, calibrations):
     name = next((f.camera for f in group if f.camera), "camera")
     first = next(iter(solutions.values()))
     return build_camera(name, list(exposures.values()), solutions, provenance=first.provenance)
-
-
-def _submit(group, catalog, run, workers, *, narrow, sources=None):
-    """Have frames matched alone: frame name to what will return the result.
-
-    A blind search takes ten times as long, above all to find nothing: in an exposure of several
-    detectors it is left for those that neither they themselves nor their neighbors could match.
-    """
-    settings = replace(run.settings, blind=False) if narrow else run.settings
-    tied = _tied(group) if narrow else ()
-    return {
-        frame.name: workers.submit(
-            Task(
-                frame,
-                settings if not narrow or frame.name in tied else run.settings,
-                catalog,
-                run.solution,
-                None if sources is None else sources[frame.name],
-            )
-        )
-        for frame in group
-    }
-
-
-def _tied(group):
-    """Names of the frames that share an exposure with others."""
-    keys = [(f.camera, f.exposure) for f in group]
-    counts = Counter(key for key in keys if None not in key)
-    return {f.name for f, key in zip(group, keys, strict=True) if counts[key] > 1}
-
-
-def _match_group(work, results, run, workers):
-    """Match the frames that could not be matched alone, from their neighbors, then blind."""
-    group, catalog = work.group, work.catalog
-    find = partial(start_from_neighbors, solution=run.solution)
-    results = find(group, results, catalog, run.settings)
-    if not run.settings.blind:
-        return results
-    tied = _tied(group)
-    failed = [
-        f
-        for f in group
-        if f.name in tied
-        and isinstance(results[f.name], FailedFrame)
-        and isinstance(results[f.name].error, MatchError)
-    ]
-    if not failed:
-        return results
-    sources = {f.name: results[f.name].sources for f in failed}
-    tasks = _submit(failed, catalog, run, workers, narrow=False, sources=sources)
-    again = {name: outcome() for name, outcome in tasks.items()}
-    if all(isinstance(result, FailedFrame) for result in again.values()):
-        return results | again
-    return find(group, results | again, catalog, run.settings)
 
 
 def _holdout_mask(catalog, settings):

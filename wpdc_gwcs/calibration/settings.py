@@ -27,8 +27,8 @@ class Settings:
     Parameters
     ----------
     weight : str, optional
-        Radial weight of the polynomial, the table has the rest: ``exp-sqrt`` (the paper's),
-        ``gaussian``, ``inverse``, ``inverse-square`` (``w1`` to ``w4`` in the paper) or
+        Radial weight of the polynomial; the table contains the rest: ``exp-sqrt`` (as in the
+        paper), ``gaussian``, ``inverse``, ``inverse-square`` (``w1`` to ``w4`` in the paper) or
         ``uniform``.
     r0 : float, optional
         Radius in px within which the polynomial follows the distortion; `None` is 0.87 times half
@@ -36,46 +36,46 @@ class Settings:
     n_grid : int, optional
         Nodes of the look-up table along each axis.
     lut : {'auto', 'none'}, optional
-        A table of what the polynomial leaves (``auto``; mean residuals are part of it where they
+        A table for the residuals of the polynomial (``auto``; it includes mean residuals if they
         predict left-out ones), or the polynomial alone (``none``).
     refine : {'auto', 'attitude', 'field', 'pv'}, optional
-        What an exposure has of its own: six linear numbers (``attitude``), also a smooth field
-        where its evidence is there (``auto``) or in any case (``field``), or a polynomial
-        (``pv``, the paper's way).
+        What is fitted for each exposure: six linear numbers (``attitude``), also a smooth field if
+        there is evidence for it (``auto``) or always (``field``), or a polynomial (``pv``, as in
+        the paper).
     degree : int or 'auto', optional
-        Degree of the delivered polynomial and largest degree of a detector's own distortion, 1 to
-        7; ``auto``: up to 7 by evidence, delivered as a cubic and a table.
+        Degree of the stored polynomial and highest degree of the distortion of a detector, 1 to 7.
+        ``auto``: up to 7 by evidence, stored as a cubic and a table.
     centroids : {'psf', 'windowed', 'given'}, optional
-        How positions are measured on images; source lists are always taken as given.
+        How positions are measured on images; source lists are always used as they are.
     reference_point : {'header', 'center', 'nearest-source'}, optional
-        Where the tangent point and the polynomial's origin are.  A header's point that lies off
+        Tangent point and origin of the polynomial.  A reference point of the header that is off
         the detector is replaced by the center.
     threshold : float, optional
         Detection threshold in standard deviations of the background.
     min_snr : float, optional
-        Least signal-to-noise ratio of the sources that are matched; of an image, only those that
-        reach it in an aperture of 1.5 FWHM in radius are kept.  0 keeps all.
+        Smallest signal-to-noise ratio of the sources that are matched.  For images, it refers to an
+        aperture with a radius of 1.5 FWHM, and fainter sources are not kept.  0 keeps all.
     max_roundness : float, optional
-        Greatest difference between the roundness of a source that is matched and that of the
-        frame's stars.
+        Largest difference between the roundness of a source that is matched and that of the stars
+        of the frame.
     max_mag : float, optional
         Magnitude of the faintest reference stars used; `None`: all.
     gain, saturation : float, optional
-        Electrons per count, and counts at which pixels are saturated, in place of what the headers
-        say.
+        Electrons per count, and counts at which pixels are saturated, instead of the values in the
+        headers.
     holdout : float, optional
-        Share of the reference stars, 0 to 0.9, kept out of every fit and measured separately.
+        Share of the reference stars, 0 to 0.9, kept out of every fit and evaluated separately.
     free_stars : bool, optional
-        Let the places of reference stars that several exposures have be unknowns, within the errors
-        of the catalog: for catalogs that are worse than the camera.
+        Fit the positions of reference stars that are in several exposures, with the errors of the
+        catalog as priors; for catalogs that are less accurate than the camera.
     blind : bool, optional
         Search a wide range of pointing, orientation, parity and scale for the match.
     seed : int, optional
         Seed of the random choice of held-out stars.
     method : {'wpdc', 'paper'}, optional
-        One solution of all exposures with learnt priors (``wpdc``), or the literal WPDC-2P
-        (``paper``), to be compared with: a polynomial of each exposure about its header's tangent
-        point, raw residuals in a bilinear table.
+        One solution of all exposures with learned priors (``wpdc``), or WPDC-2P exactly as
+        published (``paper``), for comparison: a polynomial for each exposure about the tangent
+        point of its header, and raw residuals in a bilinear table.
     """
 
     weight: str = "exp-sqrt"

@@ -1,5 +1,6 @@
 """What a run has done, stage by stage, in words: for ``-v`` and ``wpdc explain``."""
 
+import logging
 from collections import Counter
 
 import numpy as np
@@ -9,6 +10,7 @@ from wpdc_gwcs.calibration.measure import rules_of
 from wpdc_gwcs.selection import left_out
 
 __all__ = [
+    "say",
     "tell_catalog",
     "tell_frames",
     "tell_match",
@@ -17,6 +19,8 @@ __all__ = [
     "tell_solution",
     "tell_sources",
 ]
+
+log = logging.getLogger(__name__)
 
 _GAIN = {
     "given": "as given",
@@ -31,6 +35,21 @@ _COLUMNS = {
     "phot_g_mean_mag": "magnitudes",
     "bp_rp": "colors",
 }
+
+
+def say(tell, *what):
+    """Log the lines of a stage, which nobody makes where nobody reads them.
+
+    Parameters
+    ----------
+    tell : callable
+        Makes the lines.
+    *what
+        Its arguments.
+    """
+    if log.isEnabledFor(logging.INFO):
+        for line in tell(*what):
+            log.info("%s", line)
 
 
 def tell_frames(frames, groups):

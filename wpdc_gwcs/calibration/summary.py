@@ -58,7 +58,8 @@ def summary_row(frame, result, calibration, failure, settings):
     row["rms_mas"] = statistics.get("rms_mas", np.nan)
     row["seconds"] = statistics.get("seconds", result.seconds)
     epoch = np.nan if frame.epoch is None else float(frame.epoch)
-    return row | quality_of(frame, result.sources, settings) | {"epoch": epoch}
+    counts = getattr(result, "left_out", None)
+    return row | quality_of(frame, result.sources, settings, counts=counts) | {"epoch": epoch}
 
 
 def summarize(rows, run_id):

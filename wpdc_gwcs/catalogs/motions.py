@@ -113,7 +113,7 @@ def propagate(catalog, epoch, *, parallax=False):
         u(t) = \langle r (1 + \mu_r t) + \mu\,t \rangle, \qquad
         \mu = \mu_{\alpha*} p + \mu_\delta q, \qquad \mu_r = v_r \varpi / A
 
-    where r is the direction at the reference epoch, p and q the unit vectors towards East and
+    where r is the direction at the reference epoch, p and q the unit vectors toward East and
     North, and A = 4.7405 km yr / s.  The radial velocity counts as zero where it or the parallax
     is not known.  It is exact at the poles and across RA 0.  The variance of a position grows on
     each axis by

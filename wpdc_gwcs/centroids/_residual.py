@@ -152,17 +152,23 @@ class Scene:
         row = np.clip(np.rint(stars.y[candidates]), 0, len(image) - 1)
         candidates, row = candidates[order := np.argsort(row)], row[order]
         step = max(1, _STRIP // image.shape[1])
-        work = np.empty((step + 2 * margin, image.shape[1]), np.float32)
+        work = np.zeros((step + 2 * margin, image.shape[1]), np.float32)
+        lit = _lit_rows(models, len(image))
         found = [np.zeros(0, int)]
         for first in range(0, len(image), step):
             last = min(first + step, len(image))
             low, high = max(first - margin, 0), min(last + margin, len(image))
-            light = _paint(work[: high - low], models, low)
-            image[first:last] -= light[first - low : last - low]
+            light = work[: high - low]
+            for one in models:
+                one.paint(light, first_row=low)
+            for start, stop in _runs(lit[first:last]):
+                image[first + start : first + stop] -= light[first - low :][start:stop]
             k = candidates[slice(*np.searchsorted(row, [first, last]))]
             if len(k):
                 sides = old.take(k), stars.take(k)
                 found.append(k[self._disturbed(light, low, *sides, changed[k], radius, settled)])
+            for start, stop in _runs(lit[low:high]):
+                light[start:stop] = 0
         return np.sort(np.concatenate(found))
 
     def _disturbed(self, light, low, old, new, changed, radius, settled):
@@ -179,6 +185,22 @@ class Scene:
                 others[k] += sign * side.take(k).light(profile, xc[k], yc[k] + low, half)
         limit = settled * (np.sqrt(sky.variance) + _SHARE * np.abs(pixels))
         return (use & (np.abs(others) > limit)).any(axis=1)
+
+
+def _lit_rows(models, n_rows):
+    """Mark the rows of an image that any of the models has light in."""
+    change = np.zeros(n_rows + 1, int)
+    for one in models:
+        row = one.center[:, 1].astype(int)
+        np.add.at(change, np.clip(row - one.half, 0, n_rows), 1)
+        np.add.at(change, np.clip(row + one.half + 1, 0, n_rows), -1)
+    return np.cumsum(change[:-1]) > 0
+
+
+def _runs(marks):
+    """Find where each run of marks begins, and the place behind its end."""
+    edges = np.flatnonzero(np.diff(marks, prepend=False, append=False))
+    return edges.reshape(-1, 2)
 
 
 def _near_any(stars, changed, reach):

@@ -55,7 +55,7 @@ Catalog = Annotated[
         "--catalog",
         metavar="CAT",
         help="Reference catalog: FITS_LDAC, or any table astropy reads (Gaia column names); "
-        "'gaia' asks the archive, 'hats:PATH' reads a partitioned catalog.",
+        "'gaia' queries the archive, 'hats:PATH' reads a partitioned catalog.",
     ),
 ]
 WcsFile = Annotated[
@@ -95,75 +95,75 @@ def calibrate_command(
         str | None,
         typer.Option(
             metavar="KEYWORD",
-            help="Header keyword that is the same for the detectors of one exposure; default: "
-            "EXPNUM, OBSID and the like, else the time it began.",
+            help="Header keyword that is the same for all detectors of one exposure; default: "
+            "EXPNUM, OBSID and similar keywords, else the start time.",
         ),
     ] = None,
     no_camera: Annotated[
         bool,
-        typer.Option("--no-camera", help="Detectors of one exposure know nothing of each other."),
+        typer.Option("--no-camera", help="Treat the detectors of one exposure separately."),
     ] = False,
     solution: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="FILE",
-            help="Stored *.solution.asdf (once for each detector) or *.camera.asdf: keep the "
-            "distortion; each frame gets its attitude, and a field where its stars speak for one.",
+            help="Stored *.solution.asdf (once for each detector) or *.camera.asdf: keep its "
+            "distortion; fit the attitude of each frame, and a field if there is evidence.",
         ),
     ] = None,
     update: Annotated[
         bool,
         typer.Option(
             "--update",
-            help="Merge the frames into the stored solution, which follows a change that they "
-            "show.",
+            help="Merge the frames into the stored solution, and adapt it if the detector has "
+            "changed.",
         ),
     ] = False,
     refine: Annotated[
         str,
         typer.Option(
             metavar="{auto,attitude,field,pv}",
-            help="What an exposure has of its own: six linear numbers (attitude), also a smooth "
-            "field where its evidence is there (auto) or always (field), or a polynomial (pv).",
+            help="Fit for each exposure: six linear numbers (attitude), also a smooth field if "
+            "there is evidence (auto) or always (field), or a polynomial (pv).",
         ),
     ] = "auto",
     free_stars: Annotated[
         bool,
         typer.Option(
             "--free-stars",
-            help="Places of reference stars in several exposures are unknowns, within the "
-            "catalog's errors: for catalogs worse than the camera.",
+            help="Fit the positions of reference stars that are in several exposures, for catalogs "
+            "that are less accurate than the camera.",
         ),
     ] = False,
     method: Annotated[
         str,
         typer.Option(
             metavar="{wpdc,paper}",
-            help="One solution of all exposures (wpdc), or the literal WPDC-2P to compare with "
-            "(paper): a polynomial of each exposure, raw residuals in a bilinear table.",
+            help="One solution of all exposures (wpdc), or WPDC-2P exactly as published (paper): "
+            "a polynomial per exposure, raw residuals in a bilinear table.",
         ),
     ] = "wpdc",
     degree: Annotated[
         str,
         typer.Option(
             metavar="{auto,1...7}",
-            help="Degree of the polynomial; auto: by evidence, delivered as a cubic and a table.",
+            help="Degree of the polynomial; auto: by evidence, stored as a cubic and a table.",
         ),
     ] = "auto",
     lut: Annotated[
         str,
         typer.Option(
             metavar="{auto,none}",
-            help="Look-up table of what the polynomial leaves (auto), or the polynomial alone "
-            "(none).",
+            help="Look-up table for the residuals of the polynomial (auto), or the polynomial "
+            "alone (none).",
         ),
     ] = "auto",
     weight: Annotated[
         str,
         typer.Option(
             metavar="NAME",
-            help="Radial weight of the polynomial, the table has the rest: exp-sqrt, gaussian, "
-            "inverse, inverse-square (the paper's w1 to w4) or uniform.",
+            help="Radial weight of the polynomial; the table contains the rest: exp-sqrt, "
+            "gaussian, inverse, inverse-square (w1 to w4 of the paper) or uniform.",
         ),
     ] = "exp-sqrt",
     r0: Annotated[
@@ -204,7 +204,7 @@ def calibrate_command(
         float,
         typer.Option(
             metavar="SHARE",
-            help="Share of the reference stars kept out of every fit and measured separately.",
+            help="Share of the reference stars kept out of every fit and evaluated separately.",
         ),
     ] = 0.0,
     seed: Annotated[
@@ -230,7 +230,7 @@ def calibrate_command(
         bool,
         typer.Option(
             "--resume",
-            help="Leave out what a run of the same inputs, options and version has done already.",
+            help="Skip frames that a run with the same options and version has already done.",
         ),
     ] = False,
     report: Annotated[
@@ -246,9 +246,9 @@ def calibrate_command(
 
     Writes STEM.wcs.asdf and STEM.matches.ecsv for each solved frame (and STEM.sources.ecsv for
     images), DETECTOR.solution.asdf for each detector, CAMERA.camera.asdf for detectors that were
-    solved together, and summary.ecsv.  A frame that lacks something is delivered as degraded, and
-    the summary says what.  Exit status 1 if a frame was not solved: it has no WCS file, and its row
-    of the summary says why.
+    solved together, and summary.ecsv.  A frame whose WCS has a limitation is degraded, and the
+    summary names the limitation.  The exit status is 1 if a frame was not solved: it has no WCS
+    file, and its row of the summary says why.
     """
     from wpdc_gwcs.calibration import calibrate
     from wpdc_gwcs.calibration.cluster import cluster_executor
@@ -431,7 +431,7 @@ def print_changes(run):
         since = "" if last.get("first_epoch") is None else f" before {last['first_epoch']:.4f},"
         kept = ""
         if name in run.superseded:
-            from wpdc_gwcs.calibration.results import superseded_name
+            from wpdc_gwcs.calibration.names import superseded_name
 
             kept = f"; the old solution is in {superseded_name(run.superseded[name])}"
         typer.echo(

@@ -17,7 +17,7 @@ from wpdc_gwcs.exceptions import InputError
 log = logging.getLogger("wpdc_gwcs.cli")
 
 catalog_app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Prepare a reference catalog, or look at one."
+    no_args_is_help=True, rich_markup_mode=None, help="Prepare or inspect a reference catalog."
 )
 app.add_typer(catalog_app, name="catalog")
 
@@ -29,12 +29,12 @@ Box = Annotated[
     str | None,
     typer.Option(
         metavar="WEST,EAST,SOUTH,NORTH",
-        help="Part of the sky: right ascensions from WEST upwards to EAST, declinations, deg.",
+        help="Part of the sky: range of right ascension (from WEST up to EAST) and Dec, deg.",
     ),
 ]
 Around = Annotated[
     list[str] | None,
-    typer.Option(metavar="FRAME", help="Part of the sky: what this frame needs (once for each)."),
+    typer.Option(metavar="FRAME", help="Part of the sky: around this frame (once for each)."),
 ]
 
 # What a column that is not there would have been for.
@@ -68,18 +68,18 @@ def prepare_command(
     box: Box = None,
     around: Around = None,
     min_mag: Annotated[
-        float | None, typer.Option(metavar="MAG", help="Magnitude of the brightest stars kept.")
+        float | None, typer.Option(metavar="MAG", help="Magnitude of the brightest stars to keep.")
     ] = None,
     max_mag: Annotated[
-        float | None, typer.Option(metavar="MAG", help="Magnitude of the faintest stars kept.")
+        float | None, typer.Option(metavar="MAG", help="Magnitude of the faintest stars to keep.")
     ] = None,
     max_ruwe: Annotated[
         float | None,
-        typer.Option(metavar="RUWE", help="Greatest RUWE; 1.4 keeps single stars."),
+        typer.Option(metavar="RUWE", help="Largest RUWE; 1.4 keeps single stars."),
     ] = None,
     max_error: Annotated[
         float | None,
-        typer.Option(metavar="MAS", help="Greatest error of the position on an axis."),
+        typer.Option(metavar="MAS", help="Largest error of the position along an axis."),
     ] = None,
     tap_url: TapUrl = None,
     cache: Cache = None,
@@ -89,8 +89,8 @@ def prepare_command(
 ):
     """Cut, merge and clean reference catalogs, and write one table.
 
-    Columns have Gaia's names and units, whatever they were called; a star that is there several
-    times is kept once, with its best values.  What is not known of a star breaks no rule.
+    The columns of the table have the names and units of Gaia.  Duplicate rows of a star are
+    merged, keeping the best values.  A missing value never excludes a star.
     """
     from astropy.table import vstack
 
@@ -149,7 +149,7 @@ def info_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Tell what a catalog has: sky, epoch, columns, and how many stars of each magnitude."""
+    """Describe a catalog: sky area, epoch, columns, and the number of stars per magnitude."""
     region, inside = _sky(cone, box, around)
     stars = _read(catalog, region, tap_url=tap_url, cache=cache)
     stars = stars[inside(stars)]

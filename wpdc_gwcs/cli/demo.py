@@ -30,7 +30,7 @@ def demo_command(
     """Simulate five exposures of a camera with 40 px of distortion, calibrate them, show the truth.
 
     One exposure is an image, four are source lists.  All inputs, results and pictures are kept in
-    the output folder.  Exit status 1 if the WCS is off its own truth by more than 0.02 px rms.
+    the output folder.  The exit status is 1 if the error of the WCS exceeds 0.02 px rms.
     """
     from wpdc_gwcs.calibration import calibrate
     from wpdc_gwcs.io import read_frames

@@ -37,27 +37,27 @@ def evaluate_command(
         typer.Option(
             "--output",
             metavar="FILE",
-            help="Write the tables instead of printing them: that of the frames here, the others "
-            "into FILE with .detectors, .truth, .truth-detectors, .weights before its suffix.",
+            help="Write the tables instead of printing them: the frames to FILE, the others to "
+            "FILE with .detectors, .truth, .truth-detectors, .weights before its suffix.",
         ),
     ] = None,
     table: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Also write the detectors as the paper's table 2: .tex LaTeX, .ecsv ECSV, else "
-            "plain text.",
+            help="Also write the detectors like table 2 of the paper: LaTeX (.tex), ECSV (.ecsv) "
+            "or plain text.",
         ),
     ] = None,
     truth: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="Folder of wpdc simulate: score the results against its truth."
+            metavar="DIR", help="Folder of wpdc simulate: compare the results with its truth."
         ),
     ] = None,
     limit: Annotated[
         float,
-        typer.Option(metavar="PX", help="Errors below this count for the share of the area."),
+        typer.Option(metavar="PX", help="Limit for the share of the area with small errors."),
     ] = 0.01,
     min_radius: Annotated[
         float | None,
@@ -69,7 +69,7 @@ def evaluate_command(
     ] = None,
     about: Annotated[
         str | None,
-        typer.Option(metavar="X,Y", help="Pixel from which these radii count instead."),
+        typer.Option(metavar="X,Y", help="Pixel from which these radii are measured instead."),
     ] = None,
     region: Annotated[
         str | None,
@@ -79,11 +79,11 @@ def evaluate_command(
         float | None, typer.Option(metavar="MAG", help="Only stars fainter than this.")
     ] = None,
     max_mag: Annotated[
-        float | None, typer.Option(metavar="MAG", help="Only stars as bright as this.")
+        float | None, typer.Option(metavar="MAG", help="Only stars of this magnitude or brighter.")
     ] = None,
     min_snr: Annotated[
         float | None,
-        typer.Option(metavar="RATIO", help="Only stars of a higher signal-to-noise ratio."),
+        typer.Option(metavar="RATIO", help="Only stars with a higher signal-to-noise ratio."),
     ] = None,
     plots: Annotated[
         Path | None,
@@ -93,29 +93,29 @@ def evaluate_command(
         str | None,
         typer.Option(
             metavar="NAMES",
-            help="Radial weights that the polynomial is fitted anew with, with commas, by name or "
-            "as w1 to w4; default: all five.",
+            help="Radial weights to compare, separated by commas, by name or as w1 to w4; default: "
+            "all five.",
         ),
     ] = None,
     degree: Annotated[
-        int, typer.Option(metavar="N", help="Degree of that polynomial, 1 to 7.")
+        int, typer.Option(metavar="N", help="Degree of the polynomial in that comparison, 1 to 7.")
     ] = 3,
     no_weights: Annotated[
         bool,
         typer.Option(
             "--no-weights",
-            help="Do not fit the polynomial anew with each of the five radial weights.",
+            help="Do not compare the radial weights.",
         ),
     ] = False,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Residuals of calibrated frames, pooled by detector: clipped moments in px and mas, d80, area.
+    """Print statistics of the residuals of calibrated frames, by detector and by frame.
 
-    Then each frame, held-out stars apart; with --truth the error of the WCS itself, wrong pairs and
-    pulls; and the same for all frames of a detector with each of the five radial weights, without
-    and with a table, from the *.wcs.asdf files beside the matches.
+    With --truth, also print the error of the WCS itself, wrong pairs and pulls.  Finally, compare
+    solutions with each of the five radial weights, without and with a table.  This needs the
+    *.wcs.asdf files next to the matches.
     """
     from astropy.table import QTable
 
@@ -357,7 +357,7 @@ def _table_of_weights(compared):
 
 def _write_plots(frames, compared, folder, *, overwrite):
     from wpdc_gwcs import plotting
-    from wpdc_gwcs.calibration.results import file_stem
+    from wpdc_gwcs.calibration.names import file_stem
 
     figures = {}
     for frame in frames:

@@ -19,9 +19,9 @@ Degree = Annotated[
     int | None,
     typer.Option(
         metavar="N",
-        help="Degree of the polynomials: 1 to 7, for sip 2 to 9. Default: that of the solution for "
-        "fits and cpdis, for the others the lowest that is good to 0.001 px, or nearly as good as "
-        "any.",
+        help="Degree of the polynomials: 1 to 7, or 2 to 9 for sip. Default: for fits and cpdis "
+        "that of the solution, otherwise the lowest one that is accurate to 0.001 px or nearly as "
+        "good as any other.",
     ),
 ]
 
@@ -34,9 +34,9 @@ def export_command(
         typer.Option(
             "--format",
             metavar="{fits,cpdis,tpv,head,sip,tab,stock}",
-            help="fits: TPV + table, exact for wpdc; cpdis: for astropy.wcs; tpv, head: TPV of all "
-            "of it, for SWarp, SCAMP, GalSim (as FITS, as text); sip: for DS9; tab: for wcslib; "
-            "stock: gwcs alone. Default with --into: tpv.",
+            help="fits: TPV and table, exact for wpdc; cpdis: for astropy.wcs; tpv, head: TPV "
+            "fitted to everything, for SWarp, SCAMP, GalSim (FITS or text); sip: for DS9; tab: for "
+            "wcslib; stock: gwcs alone. Default with --into: tpv.",
         ),
     ] = None,
     output: Annotated[
@@ -47,19 +47,19 @@ def export_command(
         str | None,
         typer.Option(
             metavar="IMAGE[EXT]",
-            help="Write the WCS into this image in place of the one that it has.",
+            help="Replace the WCS of this image.",
         ),
     ] = None,
     degree: Degree = None,
     alternates: Annotated[
         str,
-        typer.Option(metavar="{keep,remove}", help="With --into: what becomes of alternate WCSs."),
+        typer.Option(metavar="{keep,remove}", help="With --into: keep or remove alternate WCSs."),
     ] = "keep",
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Write a calibrated WCS in a format that other programs read; say how far it deviates."""
+    """Write a calibrated WCS in a format for other programs, and print its deviation."""
     if format is None and into is not None:
         format = "tpv"
     if format not in FORMATS:
@@ -174,14 +174,14 @@ def convert_command(
     output: Annotated[Path, typer.Option("--output", metavar="OUT", help="File to write.")],
     size: Annotated[
         tuple[int, int] | None,
-        typer.Option(metavar="NX NY", help="Size of the image, where the file does not tell."),
+        typer.Option(metavar="NX NY", help="Size of the image, if it is not in the file."),
     ] = None,
     degree: Degree = None,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Convert the WCS of any file to the models of wpdc, in any format; say how far it deviates."""
+    """Convert the WCS of any file to the models of wpdc, in any format; print the deviation."""
     from wpdc_gwcs.camera import Camera
     from wpdc_gwcs.io.any_wcs import read_any
 

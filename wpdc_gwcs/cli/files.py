@@ -60,7 +60,7 @@ def pix2sky_command(
     output: Output = None,
     overwrite: Overwrite = False,
 ):
-    """Pixel to sky: prints RA and Dec (ICRS, deg); a table gets the columns ra and dec."""
+    """Convert pixels to RA and Dec (ICRS, deg); a table gets the columns ra and dec."""
     _transform(file, points, origin, output, overwrite, forward=True)
 
 
@@ -77,7 +77,7 @@ def sky2pix_command(
     output: Output = None,
     overwrite: Overwrite = False,
 ):
-    """Sky to pixel: prints x and y; a table gets the columns x and y.  Off the detector: nan."""
+    """Convert RA and Dec to pixels; a table gets the columns x and y.  Off the detector: nan."""
     _transform(file, points, origin, output, overwrite, forward=False)
 
 

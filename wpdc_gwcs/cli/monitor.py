@@ -23,7 +23,7 @@ def monitor_command(
         Path,
         typer.Argument(
             metavar="SOLUTION",
-            help="The stored *.solution.asdf, or *.camera.asdf for all.",
+            help="The stored *.solution.asdf, or *.camera.asdf for all detectors.",
         ),
     ],
     paths: Annotated[
@@ -36,40 +36,38 @@ def monitor_command(
     every: Annotated[
         float | None,
         typer.Option(
-            metavar="DAYS", help="Follow it over time, in periods of so many days; 1: each night."
+            metavar="DAYS", help="Test periods of this length in days separately; 1: each night."
         ),
     ] = None,
     false_alarm: Annotated[
         float,
-        typer.Option(
-            metavar="P", help="Accepted probability of an alarm without a change, in all of it."
-        ),
+        typer.Option(metavar="P", help="Accepted probability of any alarm without a change."),
     ] = 0.01,
     output: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Write the cells (ECSV); with --every the periods, and their cells into FILE with "
-            ".cells before its suffix.",
+            help="Write the cells (ECSV); with --every write the periods, and their cells to FILE "
+            "with .cells before its suffix.",
         ),
     ] = None,
     plots: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="Also draw each detector over time, as a whole and cell by cell."
+            metavar="DIR", help="Also draw each detector over time, in total and cell by cell."
         ),
     ] = None,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Is a stored solution still right?  Exit status 1 if the residuals say that it is not.
+    """Test whether a stored solution is still valid.  The exit status is 1 if it is not.
 
-    The frames must have been calibrated with it: wpdc calibrate --solution SOLUTION.  What fields
-    of single exposures have taken is put back.  Of a camera every detector is tested, and
-    --false-alarm is shared by all detectors and periods.
+    The frames must have been calibrated with it: wpdc calibrate --solution SOLUTION.  The part of
+    a change that the fields of single exposures have absorbed is added back.  All detectors of a
+    camera are tested, and --false-alarm is shared by all detectors and periods.
     """
-    from wpdc_gwcs.calibration.results import file_stem
+    from wpdc_gwcs.calibration.names import file_stem
     from wpdc_gwcs.io import write_table
 
     if plots is not None:

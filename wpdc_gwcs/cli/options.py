@@ -135,27 +135,25 @@ Config = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE.toml",
-        help="Options from a TOML file (keys as on the command line); typed options win.",
+        help="Options from a TOML file; the command line takes precedence.",
         callback=_load_config,
         is_eager=True,
     ),
 ]
 Threshold = Annotated[
     float,
-    typer.Option(metavar="SIGMA", help="Detection threshold over the background noise."),
+    typer.Option(metavar="SIGMA", help="Detection threshold above the background."),
 ]
 
 MinSNR = Annotated[
     float,
-    typer.Option(
-        metavar="RATIO", help="Least signal-to-noise ratio of a source kept; 0 keeps all."
-    ),
+    typer.Option(metavar="RATIO", help="Smallest signal-to-noise ratio of sources; 0 keeps all."),
 ]
 
 Blind = Annotated[
     bool,
     typer.Option(
-        "--blind", help="Search flips, 90 degree turns, scale +-5 % and pointing +-1/4 frame."
+        "--blind", help="Also try flips, 90 deg rotations, scale +-5 %, pointing +-1/4 frame."
     ),
 ]
 
@@ -176,15 +174,13 @@ Origin = Annotated[
     int | None,
     typer.Option(
         metavar="{0,1}",
-        help="Number of the first pixel in tables of sources; default: as they tell, else 0.",
+        help="Number of the first pixel in tables of sources; default: from the table, else 0.",
     ),
 ]
 
 MaxRoundness = Annotated[
     float,
-    typer.Option(
-        metavar="R", help="Greatest difference from the roundness that the frame's stars have."
-    ),
+    typer.Option(metavar="R", help="Largest difference in roundness from the stars of the frame."),
 ]
 MaxMag = Annotated[
     float | None,
@@ -192,28 +188,26 @@ MaxMag = Annotated[
 ]
 Gain = Annotated[
     float | None,
-    typer.Option(metavar="E/COUNT", help="Electrons per count, in place of the header's."),
+    typer.Option(metavar="E/COUNT", help="Electrons per count, instead of the header's value."),
 ]
 Saturation = Annotated[
     float | None,
-    typer.Option(metavar="COUNTS", help="Level of saturated pixels, in place of the header's."),
+    typer.Option(metavar="COUNTS", help="Saturation level, instead of the header's value."),
 ]
 Mask = Annotated[
     str | None,
-    typer.Option(
-        metavar="FILE[EXT]", help="Pixels that must not be used, in place of the file's own."
-    ),
+    typer.Option(metavar="FILE[EXT]", help="Mask of bad pixels, instead of the masks in the file."),
 ]
 MaskBits = Annotated[
     int | None,
     typer.Option(
-        metavar="SUM", help="Bits of masks that are bad; default: those that the pixels bear out."
+        metavar="SUM", help="Bits of bad pixels in masks; default: from header and pixels."
     ),
 ]
 WeightMap = Annotated[
     str | None,
     typer.Option(
-        metavar="FILE[EXT]", help="Inverse variances of the sky, in place of the file's own."
+        metavar="FILE[EXT]", help="Inverse variances of the sky, instead of those in the file."
     ),
 ]
 
@@ -222,7 +216,7 @@ TapUrl = Annotated[
     typer.Option(
         metavar="URL",
         envvar="WPDC_GWCS_TAP_URL",
-        help="Service that is asked for --catalog gaia; default: the Gaia archive at ESA.",
+        help="TAP service for --catalog gaia; default: the Gaia archive at ESA.",
     ),
 ]
 Cache = Annotated[
@@ -230,21 +224,17 @@ Cache = Annotated[
     typer.Option(
         metavar="DIR",
         envvar="WPDC_GWCS_CACHE",
-        help="Folder of what came from there; default: that of astropy's caches.",
+        help="Folder for downloaded stars; default: in the cache of astropy.",
     ),
 ]
-Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace files that are already there.")
-]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]
 Verbose = Annotated[
     int,
     typer.Option(
-        "-v", "--verbose", count=True, help="Say what happens (-vv: more).", callback=_verbose
+        "-v", "--verbose", count=True, help="Print progress (-vv: details).", callback=_verbose
     ),
 ]
-Quiet = Annotated[
-    bool, typer.Option("-q", "--quiet", help="Say nothing but errors.", callback=_quiet)
-]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.", callback=_quiet)]
 
 
 def by_hand(epoch, pixel_scale, origin):

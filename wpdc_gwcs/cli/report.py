@@ -23,7 +23,7 @@ def report_command(
 ):
     """Write one self-contained HTML page about a result folder.
 
-    Detectors come first, pooled over their frames, then the frames, folded, and the settings.
+    The page has the detectors, pooled over their frames, then each frame, and the settings.
     """
     require_plotting("the report")
     output = folder / "report.html" if output is None else output

@@ -51,7 +51,7 @@ def show_command(
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
 ):
-    """Say what is in a file, in words and in one picture."""
+    """Describe the contents of a file, in words and in one picture."""
     _check_picture(output, overwrite)
     lines, draw = _told(file)
     for label, text in lines:
@@ -83,9 +83,9 @@ def explain_command(
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
 ):
-    """Say why a frame is solved, degraded or refused: every stage with counts, and what to try.
+    """Explain why a frame is solved, degraded or refused, stage by stage, and what to try.
 
-    The frame is solved by itself, without others of its camera.  Exit status 1 if it fails.
+    The frame is solved by itself, without others of its camera.  The exit status is 1 if it fails.
     """
     from wpdc_gwcs.catalogs import catalog_source
     from wpdc_gwcs.explanation import explain_frame
@@ -107,7 +107,7 @@ def explain_command(
         mark = "ok" if stage.went_well else "!!"
         for k, line in enumerate(stage.lines):
             typer.echo(f"{stage.name if k == 0 else '':<10}{mark if k == 0 else '':<4}{line}")
-    typer.echo(f"\n{told.frame.name} is {told.status}")
+    typer.echo(f"\n{told.frame.name}: {told.status}")
     for advice in told.advice:
         typer.echo(f"try: {advice}")
     if output is not None:

@@ -25,12 +25,12 @@ def simulate_command(
         typer.Option(
             metavar="NAME",
             help="Camera: generic (one detector), csst-msc (18 detectors of 9216 x 9232 px) or "
-            "bass-90prime (four chips about a reference point between them).",
+            "bass-90prime (four chips around a common reference point).",
         ),
     ] = "generic",
     detectors: Annotated[
         str | None,
-        typer.Option(metavar="NAMES", help="Some of the camera's detectors: g-1,y-4; default all."),
+        typer.Option(metavar="NAMES", help="Detectors of the camera, as in g-1,y-4; default all."),
     ] = None,
     exposures: Annotated[
         int, typer.Option(metavar="N", help="Dithered exposures of each field.")
@@ -39,8 +39,8 @@ def simulate_command(
         int | None,
         typer.Option(
             metavar="N",
-            help="Fields; those without a --center are spread over the sky. Default 1, or as many "
-            "as there are centers.",
+            help="Number of fields; those without a --center are spread over the sky. Default 1, "
+            "or the number of centers.",
         ),
     ] = None,
     center: Annotated[
@@ -67,11 +67,11 @@ def simulate_command(
     ] = None,
     distortion: Annotated[
         float | None,
-        typer.Option(metavar="PX", help="Greatest displacement by distortion; 40, csst-msc 200."),
+        typer.Option(metavar="PX", help="Largest displacement; default 40, csst-msc 200."),
     ] = None,
     waves: Annotated[
         float | None,
-        typer.Option(metavar="PX", help="Amplitude of fine structure no cubic can take."),
+        typer.Option(metavar="PX", help="Amplitude of fine structure that no cubic can follow."),
     ] = None,
     pixel_scale: Annotated[
         float | None, typer.Option(metavar="ARCSEC", help="Pixel scale.")
@@ -83,8 +83,8 @@ def simulate_command(
         str | None,
         typer.Option(
             metavar="N",
-            help="Stars per square arcmin; LOW:HIGH from field to field in equal ratios, or one "
-            "for each field: 20,50,1000.",
+            help="Stars per square arcmin; LOW:HIGH increases from field to field by equal "
+            "factors; 20,50,1000 is one value per field.",
         ),
     ] = None,
     magnitudes: Annotated[
@@ -97,7 +97,7 @@ def simulate_command(
     ] = None,
     refraction: Annotated[
         float,
-        typer.Option(metavar="MAS", help="Shift towards the zenith per magnitude of color."),
+        typer.Option(metavar="MAS", help="Shift toward the zenith per magnitude of color."),
     ] = 0.0,
     lateral_color: Annotated[
         float,
@@ -134,7 +134,7 @@ def simulate_command(
         str | None,
         typer.Option(
             metavar="YEAR",
-            help="Epoch of the exposures, or FIRST:LAST; the catalog is of 2016.",
+            help="Epoch of the exposures, or FIRST:LAST; the epoch of the catalog is 2016.",
         ),
     ] = None,
     proper_motion: Annotated[
@@ -143,16 +143,16 @@ def simulate_command(
     ] = None,
     dither: Annotated[
         float | None,
-        typer.Option(metavar="ARCSEC", help="Exposures point within this of the center."),
+        typer.Option(metavar="ARCSEC", help="Range of the pointings around the center."),
     ] = None,
     fwhm: Annotated[float | None, typer.Option(metavar="PX", help="Width of the PSF.")] = None,
     spurious: Annotated[
         float | None, typer.Option(metavar="SHARE", help="Spurious sources in the lists.")
     ] = None,
     lost: Annotated[
-        float, typer.Option(metavar="SHARE", help="Stars that the lists do not have.")
+        float, typer.Option(metavar="SHARE", help="Stars missing in the lists.")
     ] = 0.05,
-    seed: Annotated[int, typer.Option(metavar="N", help="Another seed, another camera.")] = 1,
+    seed: Annotated[int, typer.Option(metavar="N", help="Another seed gives another camera.")] = 1,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,

@@ -50,8 +50,8 @@ class Background:
         Counts in one unit of `image` and `rms`: 1 but for images whose noise is so small or great
         in counts that squares of float32 would not hold it.
     photons : (ny, nx) float32 ndarray or None, optional
-        Variance of a star's photons relative to what the gain says, where pixels differ in response
-        or exposure, which a weight map or the filters of a mosaic tell; None elsewhere.
+        Variance of the photons of a star relative to that by the gain, if pixels differ in response
+        or exposure, which is known from a weight map or the filters of a mosaic; None otherwise.
     """
 
     image: np.ndarray
@@ -131,12 +131,12 @@ class Background:
 
 @dataclass(frozen=True, eq=False)
 class BrightPixels:
-    """The bright pixels of an image, background included: all that saturation can be about.
+    """The bright pixels of an image, background included, which may be saturated.
 
     Parameters
     ----------
     indices : (N,) ndarray of int
-        Their places in the flat image, ascending.
+        Their indices in the flat image, ascending.
     values : (N,) ndarray
         Their counts.
     """
@@ -162,7 +162,7 @@ class BrightPixels:
 
 
 def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3, overwrite=False):
-    """Take a smooth background off an image and map its noise.
+    """Subtract a smooth background from an image and map its noise.
 
     Parameters
     ----------
@@ -197,10 +197,10 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
 
     Notes
     -----
-    The mode of every cell after clipping (Bertin & Arnouts 1996, A&AS 117, 393), median filtered
-    and interpolated by bicubic splines, by way of `sep`.  The raw mosaic of a color camera, which
-    shows by a pattern of 2 x 2 px, has a background for each of the four, and the four are brought
-    to one response to the stars.
+    The background is the mode of every cell after clipping (Bertin & Arnouts 1996, A&AS 117, 393),
+    median filtered and interpolated by bicubic splines with `sep`.  The raw mosaic of a color
+    camera is recognized by a pattern of 2 x 2 px.  It has a background for each of the four planes,
+    which are scaled to the same response to stars.
 
     Examples
     --------

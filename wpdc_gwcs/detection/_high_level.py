@@ -62,24 +62,25 @@ def detect_sources(
     saturation=None,
     deblend_contrast=0.002,
 ):
-    r"""Find the sources of an image and measure what tells a clean star from the rest.
+    r"""Find the sources of an image, and measure their positions, shapes and flags.
 
     Parameters
     ----------
     data : Background or (ny, nx) array_like
-        Image, already without its background, or with; hits are then masked too.
+        Image without background, or a plain image, whose background is then subtracted and whose
+        hits are masked.
     threshold : float, optional
-        Least significance of a source's peak, in standard deviations of the smoothed noise.
+        Smallest significance of the peak of a source, in standard deviations of the smoothed noise.
     mask : (ny, nx) array_like of bool, optional
         True where a pixel must not be used; only for a plain image.
     gain : float, optional
-        Electrons per count, for the photon noise in the errors; without it only the background's
-        noise counts.
+        Electrons per count, for the photon noise in the errors; without it, only the noise of the
+        background is used.
     saturation : float, optional
         Counts, background included, from which a pixel is saturated.  If not given, it is the
         plateau of the brightest pixels, if they have one.
     deblend_contrast : float, optional
-        Least share of the flux that makes a peak within a larger source a source of its own.
+        Smallest share of the flux for which a peak within a larger source is a separate source.
 
     Returns
     -------
@@ -94,7 +95,7 @@ def detect_sources(
     ValueError
         If an option is out of range.
     DetectionError
-        If there are no sources, or nothing to find them on.
+        If there are no sources or no usable pixels.
 
     Notes
     -----
@@ -159,11 +160,11 @@ def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_co
     sources : `~astropy.table.Table`
         The known sources, from `detect_sources`.
     threshold : float, optional
-        Least significance of a source's peak, in standard deviations of the smoothed noise.
+        Smallest significance of the peak of a source, in standard deviations of the smoothed noise.
     gain : float, optional
         Electrons per count.
     deblend_contrast : float, optional
-        Least share of the flux that makes a peak within a larger source a source of its own.
+        Smallest share of the flux for which a peak within a larger source is a separate source.
 
     Returns
     -------
@@ -297,7 +298,7 @@ def _unlike_stars(minor, size, snr, flags):
 
 
 def _blended(x, y, flux, fwhm):
-    """Mark sources whose core holds more than a few per cent of a neighbor's light."""
+    """Mark sources whose core holds more than a few percent of a neighbor's light."""
     blended = np.zeros(len(x), bool)
     pairs = KDTree(np.column_stack([x, y])).query_pairs(4 * fwhm, output_type="ndarray")
     if len(pairs) == 0:

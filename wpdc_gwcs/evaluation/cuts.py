@@ -1,4 +1,4 @@
-"""Which stars, and which part of a detector, statistics are of."""
+"""Limits on the stars, and on the part of a detector, for statistics."""
 
 from dataclasses import dataclass
 
@@ -11,25 +11,25 @@ _MAGNITUDE, _SNR = "phot_g_mean_mag", "snr"
 
 @dataclass(frozen=True)
 class Cuts:
-    """Limits on the stars whose residuals count; without any, all of them.
+    """Limits on the stars whose residuals are used; by default there are none.
 
     Parameters
     ----------
     min_radius, max_radius : float, optional
-        Least and greatest distance from ``about``, px.
+        Smallest and largest distance from ``about``, px.
     about : (float, float), optional
-        Point from which distances count, px, zero based; the reference point by default.
+        Point from which distances are measured, px, zero based; by default the reference point.
     min_magnitude, max_magnitude : float, optional
         Magnitudes of the brightest and of the faintest star.
     min_snr : float, optional
         Signal-to-noise ratio that stars must exceed.
     region : (float, float, float, float), optional
-        Least and greatest x, least and greatest y, px, zero based.
+        Smallest and largest x, smallest and largest y, px, zero based.
 
     Raises
     ------
     ValueError
-        If a limit is not a number, or nothing lies between two of them.
+        If a limit is not a number, or a lower limit is not below the upper one.
 
     Examples
     --------

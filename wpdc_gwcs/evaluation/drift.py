@@ -1,4 +1,4 @@
-"""Whether a stored solution still holds; where it does not, and by how much.
+"""Test whether a stored solution is still valid, and where and by how much it has changed.
 
 ::
 
@@ -44,14 +44,14 @@ _UNCHANGED_SHARE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """Whether a stored solution still holds, where it does not, and by how much.
+    """Result of a test whether a stored solution is still valid.
 
     Parameters
     ----------
     drifted : bool
         Whether the residuals contradict the solution.
     p_value : float
-        Probability of residuals as unlikely as these if nothing has changed.
+        Probability of such residuals, or less likely ones, if nothing has changed.
     false_alarm : float
         Limit on the p-value: how often an unchanged instrument is reported as changed.
     amplitude : float
@@ -65,8 +65,8 @@ class Drift:
         Cells in which the residuals were averaged, most significant first: ``x_min``, ``x_max``,
         ``y_min``, ``y_max`` in px, ``n``, means ``dx``, ``dy`` and their ``sigma_dx``,
         ``sigma_dy`` in px, ``p_value`` of each cell alone, and ``changed``.  If there is a drift,
-        the linear part of what has not changed is taken off, and the stars of a cell that has
-        changed no longer count in those about it.
+        the linear part of the unchanged cells is subtracted, and the stars of a changed cell are
+        not used in larger cells around it.
     """
 
     drifted: bool
@@ -103,19 +103,20 @@ def detect_drift(solution, matches, *, false_alarm=0.01):
 
     Notes
     -----
-    1. The residuals are averaged in 2 x 2 to 16 x 16 cells.  Their variance is that of the stars'
-       errors, scaled to the observed scatter and, with several frames, to the scatter of the means
-       from frame to frame (turbulence is common to the stars of one cell), and that of the
-       solution; a single frame may differ by as much as those behind the solution did.
+    1. The residuals are averaged in 2 x 2 to 16 x 16 cells.  Their variance is the sum of two: the
+       variance from the errors of the stars and that of the solution.  The former is scaled to the
+       observed scatter and, with several frames, to the scatter of the means from frame to frame
+       (turbulence is common to the stars of one cell).  A single frame may differ by as much as the
+       frames of the solution did.
     2. The most significant cell, its probability multiplied by the number of cells (Bonferroni,
        which holds whatever the correlation between cells), and the chi-square of the whole
        detector, with the correlation of the table's errors, have half of the false alarms each.
-    3. The attitudes of the frames have taken a linear part of a change.  It is what the largest
-       set of cells says that agree on one: a robust fit from many starting points.  It is taken
-       off, and cells are tested again: large ones that have changed as a whole, then small ones,
-       then what these leave of larger ones.
+    3. The attitudes of the frames have absorbed the linear part of a change.  It is found from the
+       largest set of cells that agree on a linear map, by a robust fit from many starting points.
+       It is subtracted, and cells are tested again: large cells that have changed as a whole, then
+       small ones, then the rest of larger ones.
 
-    A change that is linear over the whole detector is not seen: it is in the attitudes.
+    A change that is linear over the whole detector is not seen, because the attitudes absorb it.
 
     Examples
     --------

@@ -25,7 +25,7 @@ _LEAST_STARS = 8
 
 @dataclass(frozen=True, eq=False)
 class DriftHistory:
-    """What became of a stored solution over time.
+    """Residuals and drift of a detector with a stored solution over time.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class DriftHistory:
 
 
 def split_periods(epochs, days):
-    """Tell which frames belong to which period.
+    """Group frames by period.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def split_periods(epochs, days):
 
 
 def residuals_of_attitude(calibration, matches):
-    """Give the residuals that a frame would have without a field of its own.
+    """Return the residuals that a frame would have without its field.
 
     Parameters
     ----------
@@ -106,8 +106,8 @@ def residuals_of_attitude(calibration, matches):
     Returns
     -------
     `~astropy.table.Table`
-        The same, or a copy whose ``dx`` and ``dy`` have the field again, less the linear part that
-        an attitude takes: a field takes what drifts, too.
+        The same, or a copy with the field added back to ``dx`` and ``dy``, without the linear part
+        that an attitude absorbs, because a field also absorbs a drift.
     """
     if calibration.field is None:
         return matches
@@ -137,10 +137,10 @@ def track_drift(solution, periods, *, false_alarm=0.01):
         The stored solution.
     periods : iterable of (epochs, matches)
         Epochs of the frames of a period, Julian years or NaN, and their match tables as for
-        `detect_drift`; looked at one by one, and forgotten.
+        `detect_drift`; they are used one by one and not kept.
     false_alarm : float, optional
-        Accepted probability of an alarm in a period without a change; of many periods together,
-        give a share of it.
+        Accepted probability of an alarm in a period without a change; for many periods, give a
+        share of the total.
 
     Returns
     -------

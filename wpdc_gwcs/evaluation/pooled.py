@@ -109,8 +109,8 @@ def pool_residuals(calibrations, *, cuts=None, stars="used", limit=0.01, n_bins=
 
     Notes
     -----
-    A mean of few stars is not shorter than its own error: with 0.05 px of centroid noise a cell
-    needs some hundred stars for a limit of 0.01 px.
+    The mean of a few stars cannot be smaller than its own error: with 0.05 px of centroid noise, a
+    cell needs about a hundred stars for a limit of 0.01 px.
 
     Examples
     --------
@@ -203,7 +203,7 @@ def tabulate_detectors(residuals):
 
 
 def format_table(residuals, *, form="ascii"):
-    """Write the table of detectors as the paper's table 2 has it.
+    """Write the table of detectors like table 2 of the paper.
 
     Parameters
     ----------

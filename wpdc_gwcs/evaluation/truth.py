@@ -24,7 +24,7 @@ _FAR_SIGMA, _FAR_PX = 5.0, 1.0
 
 @dataclass(frozen=True, eq=False)
 class TruthScore:
-    """How far a calibration is from the truth.
+    """Errors of a calibration compared with the truth.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ class TruthScore:
     wcs_p95, wcs_max : float
         Its 95th percentile and its greatest length, px.
     wcs_rms_static : float
-        Root mean square of what all frames of the detector have in common, px.
+        Root mean square of the error common to all frames of the detector, px.
     wcs_rms_stars : float
-        Root mean square where the stars of the fit are, px.
+        Root mean square of the error at the stars of the fit, px.
     share_below : float
         Share of the area where the error is shorter than the limit.
     limit : float
@@ -53,9 +53,10 @@ class TruthScore:
     n_used, n_wrong_used : int
         The same of those in the fit.
     pull_wcs : float
-        Error of the WCS over its stated uncertainty, root mean square per axis; 1 if it is right.
+        Ratio of the error of the WCS to its stated uncertainty, root mean square per axis; 1 is
+        correct.
     pull_stars : float
-        Error of the measured positions over their stated one, of the right pairs in the fit.
+        The same ratio for the measured positions, for the right pairs in the fit.
     error_x, error_y : (n, n) ndarray
         Error of the WCS on the grid over the detector, px; NaN outside the cuts.
     """

@@ -9,7 +9,7 @@ __all__ = ["uncorrected_residuals"]
 
 
 def uncorrected_residuals(calibration):
-    """Give the residuals of a frame without polynomial and table.
+    """Return the residuals of a frame without polynomial and table.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ __all__ = ["WeightResult", "compare_weights", "tabulate_weights"]
 
 @dataclass(frozen=True, eq=False)
 class WeightResult:
-    """Residuals of the solution that one radial weight gives.
+    """Residuals of the solution with one radial weight.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class WeightResult:
     dx, dy : (N,) ndarray
         Residuals of the polynomial alone, px.
     table_dx, table_dy : (N,) ndarray
-        Residuals with a look-up table of what this polynomial leaves, px.
+        Residuals with a look-up table for the residuals of this polynomial, px.
     statistics, table_statistics : ResidualStatistics
         Of the former and of the latter.
     held_out : bool
@@ -105,7 +105,7 @@ class WeightResult:
 
 @one_blas_thread
 def compare_weights(calibrations, *, weights=RadialWeight.names, r0=None, degree=3):
-    """Fit the polynomial, and a table, anew with each of the radial weights.
+    """Fit the polynomial and a table with each of the radial weights.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The WCS outside: keywords and tables of FITS that are nearest to a calibration, and how near.
+"""FITS keywords and tables that approximate the WCS of a calibration, and their deviation.
 
 ::
 

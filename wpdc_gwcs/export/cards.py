@@ -1,4 +1,4 @@
-"""Header cards: numbers to the last bit, the linear keywords, where it all comes from."""
+"""Header cards: exact numbers, the linear keywords, and the origin of a WCS."""
 
 import textwrap
 
@@ -74,7 +74,7 @@ def linear_cards(code, crpix, cd, crval):
 
 
 def frame_cards(obj):
-    """Make the keywords that say whose WCS it is, for files without an image.
+    """Make the keywords that name frame and detector, for files without an image.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""CPDIS: look-up tables in front of CD and PV (FITS WCS Paper IV), which astropy.wcs applies."""
+"""CPDIS: look-up tables before CD and PV (FITS WCS Paper IV), as applied by astropy.wcs."""
 
 import numpy as np
 from astropy.io import fits
@@ -15,7 +15,7 @@ _MOST_NODES = 1 << 22
 
 
 def cpdis_form(obj, *, first_version=1):
-    """Give TPV keywords and the look-up table in the form that plain astropy.wcs applies.
+    """Return TPV keywords and the look-up table in a form for plain astropy.wcs.
 
     Parameters
     ----------
@@ -35,8 +35,8 @@ def cpdis_form(obj, *, first_version=1):
 
     Notes
     -----
-    ``CPDIS`` acts on the pixel position, in front of CD and PV, and is bilinear.  A shift d that
-    does there what the table does behind PV is found at every node by Newton's method:
+    ``CPDIS`` acts on the pixel position, before CD and PV, and is bilinear.  The shift d that has
+    the same effect there as the table after PV is found at every node by Newton's method:
     ``PV(CD (x + d - CRPIX)) = PV(CD (x - CRPIX)) - CD table(x)``.  The nodes are made denser by
     factors of two until astropy.wcs agrees everywhere.
     """

@@ -1,4 +1,4 @@
-"""The exact WCS that exports are made from and measured against."""
+"""The exact WCS from which exports are made and with which they are compared."""
 
 import warnings
 from typing import NamedTuple
@@ -32,7 +32,7 @@ class ExactWCS(NamedTuple):
 
 
 def description(obj):
-    """Give instrument and attitude of a calibration, or of a solution about its nominal pointing.
+    """Return instrument and attitude of a calibration, or of a solution at its nominal pointing.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def description(obj):
 
 
 def image_shape_of(obj):
-    """Give the shape of the detector, (ny, nx); `None` where nothing tells.
+    """Return the shape of the detector, (ny, nx), or `None` if it is unknown.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def image_shape_of(obj):
 
 
 def require_shape(obj):
-    """Give the shape of the detector, for formats that are fitted over it.
+    """Return the shape of the detector, for formats that are fitted over it.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def require_shape(obj):
 
 
 def deviation(obj, sky, *, n=401):
-    """Measure the greatest distance of another WCS from the exact one.
+    """Compute the greatest distance of another WCS from the exact one.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def deviation(obj, sky, *, n=401):
     Returns
     -------
     deviation : float
-        In undistorted pixels; NaN where the other has no answer counts as infinite.
+        In undistorted pixels; infinite if the other WCS gives NaN anywhere.
     """
     exact = description(obj)
     ny, nx = require_shape(obj)
@@ -127,7 +127,7 @@ def deviation(obj, sky, *, n=401):
 
 
 def astropy_wcs(header, tables=()):
-    """Give what astropy.wcs makes of a header.
+    """Return the `~astropy.wcs.WCS` of a header.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def astropy_wcs(header, tables=()):
 
 
 def astropy_sky(header, tables=()):
-    """Give what astropy.wcs makes of a header, as a function of zero-based pixels.
+    """Return the WCS of a header by astropy.wcs, as a function of zero-based pixels.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def astropy_sky(header, tables=()):
 
 
 def sample_plane(obj):
-    """Give pixels all over the detector and where they are on the tangent plane, for a fit.
+    """Return pixels all over the detector and their positions on the tangent plane, for a fit.
 
     Parameters
     ----------

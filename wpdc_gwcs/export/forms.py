@@ -1,13 +1,13 @@
-"""One calibration in the forms that readers of FITS know.
+"""A calibration in the forms that readers of FITS understand.
 
 ========= ============================================================== =======================
 form      content                                                        exact for
 ========= ============================================================== =======================
 ``fits``  TPV keywords, BINTABLE ``WPDC_LUT``                            this package, all of it
-``cpdis`` TPV keywords, ``CPDIS`` look-up tables in front of CD and PV   astropy, to 1e-3 px
-``tpv``   TPV keywords fitted to everything                              by what is told
-``head``  the same as text                                               the same
-``sip``   SIP polynomials fitted to everything                           by what is told
+``cpdis`` TPV keywords, ``CPDIS`` look-up tables before CD and PV        astropy, to 1e-3 px
+``tpv``   TPV keywords fitted to the whole mapping                       none: deviation given
+``head``  the same as text                                               none: deviation given
+``sip``   SIP polynomials fitted to the whole mapping                    none: deviation given
 ``tab``   ``-TAB`` table                                                 wcslib, to 1e-3 px
 ========= ============================================================== =======================
 """
@@ -68,12 +68,12 @@ class FitsForm:
 
 
 def make_form(obj, form, *, degree=None, versions: Mapping = MappingProxyType({})):
-    """Give the WCS of a calibration in a form of FITS.
+    """Return the WCS of a calibration in a form of FITS.
 
     Parameters
     ----------
     obj : Calibration or DistortionSolution
-        What is exported; a solution about its nominal pointing.
+        What is exported; a solution has its nominal pointing.
     form : {"fits", "cpdis", "tpv", "head", "sip", "tab"}
         The form.
     degree : int, optional

@@ -1,12 +1,12 @@
-"""Weights that lower the greatest error of a polynomial fit, which is what readers are told.
+"""Weights that lower the greatest error of a polynomial fit.
 
 ::
 
     w_0 = 1,    w_k+1 = w_k |e_k|^b,    e_k: errors of the fit with weights w_k
 
-This is Lawson's way to the best approximation (C. L. Lawson, thesis, UCLA 1961), with b below one
-since with one it swings.  Where a table has waves that no polynomial follows, least squares leave
-the crest of the highest one as it is; here it comes down by a third.
+This is Lawson's method for the best approximation (C. L. Lawson, thesis, UCLA 1961).  b is below
+one, because the iteration oscillates with one.  If a table has waves that no polynomial can follow,
+least squares leave the crest of the highest wave as it is; these weights reduce it by a third.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ _MOST_RMS = 1.5
 
 
 def levelling_weights(pixels, values, degree):
-    """Find weights of points with which the greatest error of a polynomial is lower.
+    """Find weights of points that reduce the greatest error of a polynomial.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def levelling_weights(pixels, values, degree):
     Returns
     -------
     weights : (N,) ndarray
-        Of the squares of the errors; ones where there is nothing to be gained.
+        Of the squares of the errors; all one if nothing can be gained.
     """
     low, high = pixels.min(axis=1), pixels.max(axis=1)
     u, v = (2.0 * pixels.T - low - high).T / (high - low)[:, np.newaxis]

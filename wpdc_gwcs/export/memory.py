@@ -14,10 +14,10 @@ _WCS_FORMS = ("tpv", "sip", "cpdis", "tab")
 
 
 class InMemory:
-    """What calibrations and solutions have in common: they give their WCS to astropy."""
+    """Methods of calibrations and solutions that return their WCS as astropy objects."""
 
     def to_header(self, format="tpv", *, degree=None):
-        """Give the WCS as FITS keywords alone.
+        """Return the WCS as FITS keywords alone.
 
         Parameters
         ----------
@@ -25,8 +25,8 @@ class InMemory:
             TPV polynomials, for SWarp, SCAMP, GalSim and astropy; or SIP polynomials, for DS9 and
             all viewers.  Both are fitted to the whole mapping, look-up table included.
         degree : int, optional
-            Degree of the polynomials; by default the lowest that is good to 1e-3 px, or nearly as
-            good as any.
+            Degree of the polynomials; by default the lowest that is accurate to 1e-3 px or nearly
+            as good as any other.
 
         Returns
         -------
@@ -55,14 +55,15 @@ class InMemory:
         return header
 
     def to_astropy_wcs(self, format="tpv", *, degree=None):
-        """Give the WCS as an `astropy.wcs.WCS`.
+        """Return the WCS as an `astropy.wcs.WCS`.
 
         Parameters
         ----------
         format : {"tpv", "sip", "cpdis", "tab"}, optional
             Polynomials fitted to the whole mapping (``tpv``, ``sip``), or polynomials and look-up
-            tables (``cpdis``) or a table alone (``tab``), good to 1e-3 px.  The tables of astropy
-            do not follow where the WCS is cut out or written with `~astropy.wcs.WCS.to_header`.
+            tables (``cpdis``) or a table alone (``tab``), accurate to 1e-3 px.  The tables of
+            astropy are not adapted if the WCS is sliced or written with
+            `~astropy.wcs.WCS.to_header`.
         degree : int, optional
             Degree of the polynomials.
 
@@ -86,14 +87,14 @@ class InMemory:
         return wcs
 
     def to_ccddata(self, data, format="tpv", *, degree=None, **kwargs):
-        """Give an image with the WCS as a `astropy.nddata.CCDData`.
+        """Return an image with the WCS as an `astropy.nddata.CCDData`.
 
         Parameters
         ----------
         data : (ny, nx) array_like or `~astropy.units.Quantity`
             The image.
         format : {"tpv", "sip"}, optional
-            As for `to_header`: cut-outs and files of a CCDData keep these, and lose tables.
+            As for `to_header`.  These are kept in cut-outs and files of a CCDData; tables are not.
         degree : int, optional
             Degree of the polynomials.
         **kwargs

@@ -1,13 +1,13 @@
-"""How SWarp goes back from the sky to pixels, and the linear part that makes its way a good one.
+"""The inverse of SWarp from the sky to pixels, and the linear part for which it is accurate.
 
 ::
 
     X = PV(U):    U_0 = X,    U_k+1 = U_k - (PV(U_k) - X),    k = 0, 1, 2
 
-SWarp (2.40 and later, ``pv_to_raw``) makes these three steps and no more.  What they leave is the
-distortion times the third power of its gradient: nothing for most cameras, 0.1 px where 200 px are
-spread over 9,000.  How much of a mapping is linear part and how much polynomial is free, and three
-steps come further the nearer the polynomial is to no distortion at all.
+SWarp (2.40 and later, ``pv_to_raw``) makes only these three steps.  The remaining error is the
+distortion times the third power of its gradient.  It is negligible for most cameras, and 0.1 px for
+200 px of distortion over 9,000 px.  The division of a mapping into a linear part and a polynomial
+is arbitrary, and three steps come closer if the polynomial contains less distortion.
 """
 
 import numpy as np
@@ -46,7 +46,7 @@ def step_errors(pv, u, plane):
 
 
 def nearer_linear_part(pv, cd, crpix, image_shape):
-    """Choose the linear part in front of a polynomial for which the three steps end nearest.
+    """Choose the linear part before a polynomial for which the three steps are most accurate.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ _MOST_NODES = 1 << 22
 
 
 def tab_form(obj, *, version=1):
-    """Give the sky at nodes, dense enough for bilinear interpolation.
+    """Return the sky at nodes, dense enough for bilinear interpolation.
 
     Parameters
     ----------
@@ -37,9 +37,9 @@ def tab_form(obj, *, version=1):
     Notes
     -----
     The nodes run from edge to edge of the detector.  The error of bilinear interpolation falls with
-    the square of their distance, so the first try tells how many are needed.  Right ascension is
-    not wrapped at 360 degrees within the table; a pole on the detector is out of reach of it, and
-    the deviation says so.
+    the square of their distance, so the first try shows how many are needed.  Right ascension is
+    not wrapped at 360 degrees within the table.  A pole on the detector cannot be represented,
+    which shows in the deviation.
     """
     require_shape(obj)
     n = _FIRST_NODES

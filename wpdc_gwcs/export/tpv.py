@@ -54,7 +54,7 @@ class TpvFit(NamedTuple):
 
 
 def fold_polynomial(obj):
-    """Give the polynomial of a calibration in the matrix of its exposure.
+    """Return the polynomial of a calibration for the matrix of its exposure.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def fold_polynomial(obj):
 
 
 def tpv_keywords(obj, pv, *, crpix=None, cd=None):
-    """Give the header of a polynomial.
+    """Return the header of a polynomial.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def _trial(obj, pv):
 
 
 def refit(obj, degree):
-    """Write the same mapping with a polynomial of another degree and a table of what it leaves.
+    """Represent the same mapping by a polynomial of another degree and a table of its residuals.
 
     Parameters
     ----------

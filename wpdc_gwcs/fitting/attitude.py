@@ -88,9 +88,9 @@ def fit_attitude(x, y, ra, dec, *, crpix, crval, cd, x_err=None, y_err=None, cli
     Notes
     -----
     The stars are projected about the current CRVAL, ``CD^-1 (xi, eta) = a + B (X, Y)`` is solved by
-    weighted least squares, CD becomes CD B and CRVAL the sky position of the reference point;
-    repeated until CRVAL stands still, so that the fit holds on the sphere for any dither and close
-    to the poles.
+    weighted least squares, CD becomes CD B and CRVAL the sky position of the reference point.  This
+    is repeated until CRVAL no longer changes, so that the fit is valid on the sphere for any dither
+    and close to the poles.
 
     Examples
     --------

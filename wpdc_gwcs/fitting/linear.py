@@ -29,7 +29,7 @@ def solve_linear(design, target, weight=None, *, leverage=False):
     design : (N, p) ndarray
         Columns of the linear model.
     target : (N,) or (N, k) ndarray
-        Values to be reproduced; several right-hand sides share the factorisation.
+        Values to be reproduced; several right-hand sides share the factorization.
     weight : (N,) ndarray, optional
         Weight of the squared residual.
     leverage : bool, optional

@@ -31,8 +31,8 @@ class RadialWeight:
 
     Notes
     -----
-    With :math:`r_d` the distance from the reference point, for :math:`r_d > r_0` (equations 6 to 9
-    of the paper, the bracket of the Gaussian put where it lets the weight fall):
+    With :math:`r_d` the distance from the reference point, the weight for :math:`r_d > r_0` is
+    (equations 6 to 9 of the paper, with the brackets of the Gaussian corrected):
 
     ==================  ======================================
     ``exp-sqrt``        :math:`\exp(-\sqrt{r_d - r_0})`

@@ -1,4 +1,4 @@
-"""The WCS of any file as a calibration: read as it is where that can be, fitted otherwise.
+"""The WCS of any file as a calibration: read as it is if possible, otherwise fitted.
 
 ::
 

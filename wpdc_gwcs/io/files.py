@@ -1,4 +1,4 @@
-"""Files as such: what kind, complete or not, and writing without leaving halves behind."""
+"""Files in general: their kind, whether they are complete, and writing them in one step."""
 
 import bz2
 import contextlib
@@ -73,7 +73,7 @@ def first_line(error):
 
 
 def as_utf8(text):
-    r"""Give a text that every file can hold.
+    r"""Return a text that every file can store.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def as_utf8(text):
 
 
 def stem_of(path):
-    r"""Give the name of a file without its folder and without the endings of data files.
+    r"""Return the name of a file without its folder and without the endings of data files.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def stem_of(path):
 
 
 def file_kind(path, *, error=FileFormatError):
-    """Tell what a file is from its first bytes.
+    """Recognize the kind of a file from its first bytes.
 
     Parameters
     ----------
@@ -194,9 +194,9 @@ def open_fits(path, *, error=FileFormatError, lazy=False):
 
     Notes
     -----
-    astropy opens a truncated file and warns; here it is an error, also when it is the data that are
-    cut short.  What astropy has to say about odd headers is of no concern to users of a
-    calibration; so do not warn of one's own inside the block.
+    astropy opens a truncated file with a warning; here it is an error, also if only the data are
+    truncated.  Warnings of astropy about unusual headers do not concern users of a calibration.
+    Because they are suppressed, do not issue other warnings inside the block.
     """
     path = Path(path)
     if (what := special_file(path)) is not None:

@@ -106,17 +106,16 @@ def read_frames(
         with the number of a plane of a cube (from zero; ``L``: the sum of all), FITS_LDAC source
         list (one frame for each of its detectors), or a table of sources, which needs ``wcs``.
     wcs : path-like or `~astropy.io.fits.Header`, optional
-        Header to use instead of the frame's own: FITS file, ``path[EXT]``, ``.head`` or other text
-        file; of several headers, one for each frame.
+        Header to use instead of that of the frame: FITS file, ``path[EXT]``, ``.head`` or other
+        text file; several headers are used for one frame each.
     detector : str, optional
         Name of the detector instead of the header's.
     name : str, optional
         Name of the frame instead of the file's.
     image_shape : (int, int), optional
-        Shape ``(ny, nx)`` of the detector, where a source list or table does not tell.
+        Shape ``(ny, nx)`` of the detector, if it is not in a source list or table.
     exposure_keyword : str, optional
-        Keyword of the header whose value tells exposures apart, instead of those that are looked
-        for.
+        Header keyword that distinguishes exposures, instead of the usual ones.
     camera : bool, optional
         Whether frames belong to a camera and an exposure; `False` leaves each on its own.
     epoch : float, optional
@@ -124,17 +123,17 @@ def read_frames(
     pixel_scale : float, optional
         Scale in arcsec / px, instead of the headers'.
     origin : {0, 1}, optional
-        Number of the first pixel in tables of sources, instead of what they tell.
+        Number of the first pixel in tables of sources, instead of that found in the table.
     mask, weight_map : path-like, optional
-        FITS image, ``path`` or ``path[EXT]``, of the pixels that must not be used, and of inverse
-        variances, in place of those in the file; of several images, those with the names or the
-        numbers of the frames' extensions.
+        FITS images, ``path`` or ``path[EXT]``, of bad pixels and of inverse variances, instead of
+        those in the file.  If a file has several images, those with the names or the numbers of
+        the extensions of the frames are used.
     mask_bits : int, optional
-        Sum of the bits of masks that are bad.  By default those that the header names, or all but
-        those whose pixels are like the rest, or that mark sources.
+        Sum of the bits that mean bad pixels in masks.  By default those that the header names, or
+        all except those that mark sources or whose pixels look like the others.
     beside : sequence of path-like, optional
-        Files with masks and weights that came with this one: they are used as those in the file
-        itself, where ``mask`` and ``weight_map`` give none.
+        Files with masks and weights that belong to this one.  They are used like those in the file
+        itself unless ``mask`` or ``weight_map`` is given.
 
     Returns
     -------
@@ -150,22 +149,22 @@ def read_frames(
     Warns
     -----
     WPDCWarning
-        If a date makes no sense, a reference system is not known, or a shape has to be guessed.
+        If a date is invalid, a reference system is unknown, or a shape has to be guessed.
 
     Notes
     -----
-    A frame is called like its file without endings; of several frames in a file, each has the name
-    or the number of its extension appended.  The detector is that of ``DETECTOR``, ``DETNAME``,
-    ``CCDNAME``, ``EXTNAME``, ... in this order; frames of one file are never one detector.
+    The name of a frame is that of its file without endings.  If a file has several frames, the name
+    or the number of the extension is appended.  The detector comes from ``DETECTOR``, ``DETNAME``,
+    ``CCDNAME``, ``EXTNAME``, ... in this order; frames of one file are never the same detector.
 
-    Extensions with masks, weights, errors, times and the like are no frames, but are used with the
-    image that they belong to (SCI, ERR, DQ and their relatives).  A mosaic of pixels behind
-    different filters, and an image of three planes that its header calls colors, are measured on
-    the sum of their light; of other cubes a plane has to be chosen.
+    Extensions with masks, weights, errors or times are not frames; they are used with the image to
+    which they belong (SCI, ERR, DQ and similar names).  A mosaic of pixels behind different
+    filters, and an image with three planes that its header describes as colors, are measured on
+    the sum of their light.  For other cubes, a plane must be chosen.
 
-    The camera is ``INSTRUME``, else ``TELESCOP``.  Frames of one camera are of one exposure if
-    ``EXPNUM``, ``OBSID`` or the like is the same or, where there is none, the time at which they
-    began; the frames of one file are so in any case, unless such an identifier differs.
+    The camera comes from ``INSTRUME``, else from ``TELESCOP``.  Frames of one camera belong to one
+    exposure if ``EXPNUM``, ``OBSID`` or a similar keyword is the same or, if there is none, the
+    start time.  Frames of one file always do, unless such a keyword differs.
     """
     if origin not in (None, 0, 1):
         raise ValueError(f"origin must be 0 or 1, got {origin!r}")

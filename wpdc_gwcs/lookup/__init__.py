@@ -1,4 +1,4 @@
-"""The look-up table: what the polynomial leaves, averaged over many exposures and interpolated.
+"""The look-up table: residuals of the polynomial, averaged over many exposures and interpolated.
 
 ::
 

@@ -133,7 +133,7 @@ def n_terms(degree):
 
 
 class Spectrum:
-    """One kernel diagonalised on the bins: cross-validation for all smoothings and degrees.
+    """One kernel diagonalized on the bins: cross-validation for all smoothings and degrees.
 
     With D = diag(sigma), the smoother minimizes |D^-1 (d - f)|^2 + s |f|^2 in the kernel's norm.
     In the space orthogonal to the polynomials of the kernel's least degree, D^-1 K D^-1 = U L U^T;

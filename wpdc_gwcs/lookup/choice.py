@@ -53,7 +53,7 @@ _MIN_BINS_TABLE = 20
 
 
 def carries_table(residual_map):
-    """Tell whether residuals are enough for a look-up table.
+    """Return whether there are enough residuals for a look-up table.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def choose_table(residual_map, *, lut="auto"):
     residual_map : ResidualMap
         Residuals of one detector.
     lut : {'auto', 'always'}, optional
-        Whether the answer may be that no table predicts best.
+        ``auto`` allows the result that no table is best.
 
     Returns
     -------
@@ -159,7 +159,7 @@ def first_choice(bins, spectrum=None):
     bins : Bins
         Occupied bins.
     spectrum : Spectrum, optional
-        A kernel diagonalised on them; the quintic if not given.
+        A kernel diagonalized on them; the quintic if not given.
 
     Returns
     -------
@@ -177,7 +177,7 @@ def first_choices(residual_maps):
     Parameters
     ----------
     residual_maps : sequence of ResidualMap
-        Other residuals of the same stars in each.  Their bins, and so the kernel diagonalised on
+        Other residuals of the same stars in each.  Their bins, and so the kernel diagonalized on
         them, which is what a choice costs, are common to all.
 
     Returns
@@ -203,7 +203,7 @@ def best_of(spectrum, value):
     Parameters
     ----------
     spectrum : Spectrum
-        A kernel diagonalised on the bins.
+        A kernel diagonalized on the bins.
     value : (M, 2) ndarray
         Values of the bins, px.
 

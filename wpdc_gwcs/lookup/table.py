@@ -63,7 +63,7 @@ def build_lookup_table(
     1. Bins are represented by their inverse-variance means at their weighted centroids.  A mean
        over a bin is not the value at its centroid: half the trace of Hessian times second moments
        is taken off, with a pilot surface.
-    2. On larger bins, every kernel and length is diagonalised once, so that generalized
+    2. On larger bins, every kernel and length is diagonalized once, so that generalized
        cross-validation over all smoothings (thirteen decades) and polynomial degrees costs next to
        nothing.
     3. The best few, and no table at all, are compared by leaving out one group of exposures after
@@ -132,7 +132,7 @@ def build_lookup_table(
 
 @dataclass(frozen=True, eq=False)
 class TableInfo:
-    """How a look-up table came about.
+    """How a look-up table was made.
 
     Parameters
     ----------
@@ -143,8 +143,8 @@ class TableInfo:
     sigma : (3, n, n) ndarray or None
         sigma_x and sigma_y in px and their correlation at the nodes.
     chi2 : float
-        Reduced chi square of the bins about the table; near 1 where the errors of the stars are
-        right.
+        Reduced chi square of the bins about the table; near 1 if the errors of the stars are
+        correct.
     """
 
     choice: TableChoice

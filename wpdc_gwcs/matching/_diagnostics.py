@@ -1,4 +1,4 @@
-"""What a match reports about itself."""
+"""Numbers that describe a match."""
 
 from dataclasses import dataclass, field
 
@@ -10,22 +10,22 @@ __all__ = ["MatchDiagnostics"]
 
 @dataclass(frozen=True, eq=False)
 class MatchDiagnostics:
-    """What was found and how sure it is.
+    """The result of a match and its evidence.
 
     Parameters
     ----------
     n_sources, n_reference : int
         Usable sources, and usable reference stars that fall on the frame.
     n_pairs : int
-        Pairs delivered.
+        Number of pairs.
     expected_by_chance : float
         Pairs that chance alone gives at the final radius, counted at shifted positions.
     purity : float
-        Estimated share of right pairs among those delivered.
+        Estimated share of right pairs.
     completeness : float
         Pairs per star of the list that has fewer on the frame.
     significance : float
-        Significance of the pairs over chance, sigma.
+        Significance of the pairs above chance, sigma.
     n_ambiguous : int
         Sources left out because there were two candidates within the tolerance.
     n_duplicates : int
@@ -47,8 +47,8 @@ class MatchDiagnostics:
     timings : dict
         Seconds spent in each stage.
     search_significance : float
-        The same with all mappings counted that the search could have found instead, for which less
-        is needed; NaN where there are too many stars for that to matter.
+        Significance that takes into account all mappings that the search could have found, with a
+        lower limit; NaN if there are too many stars for this to matter.
     """
 
     n_sources: int

@@ -335,7 +335,7 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
 
     Notes
     -----
-    The chance level is counted, not modelled: the mapped sources are shifted against the reference
+    The chance level is counted, not modeled: the mapped sources are shifted against the reference
     by vectors
     far longer than the radius (but short against the scale on which the density changes) and
     paired again.

@@ -1,4 +1,4 @@
-"""A polynomial of one attitude in the axes of another."""
+"""Conversion of a PV polynomial to the axes of another attitude."""
 
 import numpy as np
 

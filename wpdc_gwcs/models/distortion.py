@@ -55,7 +55,7 @@ class DistortionCorrection(Model):
     evaluated in one pass: in each cell of the table the whole of it is one bicubic polynomial.
     `DetectorToSky` takes the tangent plane into the same pass.
 
-    It is defined everywhere; outside its nodes the table goes on in straight lines.
+    It is defined everywhere; outside its nodes the table is continued linearly.
 
     Examples
     --------
@@ -272,8 +272,8 @@ class DistortionInverse(Model):
 class DetectorToSky(Model):
     """Detector pixels to the sky in one pass: ``distortion | sky``, to 1e-7 px.
 
-    Where there is a look-up table, the projection is taken into its cells if it is bicubic there to
-    1e-7 px, as it is but near the poles; otherwise the formulae are evaluated.
+    If there is a look-up table, the projection is included in its cells if it is bicubic there to
+    1e-7 px, which it is except near the poles.  Otherwise the formulas are evaluated.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The look-up table: residual displacements on a grid of nodes, used with a spline."""
+"""The look-up table: residual displacements on a grid of nodes, interpolated by a spline."""
 
 import numpy as np
 from astropy.modeling import Model, Parameter
@@ -55,9 +55,9 @@ class LookupTable(Model):
     Notes
     -----
     Phase 2 of WPDC-2P: ``X'' = X' - dX(x, y)``, ``Y'' = Y' - dY(x, y)``.  The nodes run from the
-    outer edge of the detector to the other, -0.5 ... n - 0.5.  Outside the nodes the table goes on
-    in straight lines with the value and the slope of its edge: it is smooth there and means little;
-    what is off the detector is for the bounding box of a WCS to say.
+    outer edge of the detector to the other, -0.5 ... n - 0.5.  Outside the nodes the table is
+    continued linearly with the value and the slope at its edge.  It is smooth there but has little
+    meaning; the bounding box of a WCS masks positions off the detector.
 
     Examples
     --------

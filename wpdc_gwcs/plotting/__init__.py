@@ -1,9 +1,10 @@
 """Figures of residuals, distortion, look-up tables and weights.
 
-Two kinds of functions, both made without ``pyplot``: nothing is shown, kept or switched behind the
-caller's back.  The figures of one frame return a new `matplotlib.figure.Figure`;
-``figure.savefig(path)`` writes it.  Those of the paper, of a detector or a whole camera, draw into
-the ``axes`` that they are given, or into new ones, and return them; ``axes.figure`` is the figure.
+There are two kinds of functions.  Neither uses ``pyplot``, so nothing is shown and no global state
+changes.  Functions for one frame return a new `matplotlib.figure.Figure`, which
+``figure.savefig(path)`` writes.  Functions for a detector or a whole camera, like the figures of
+the paper, draw into the given ``axes`` or into new ones, and return them; ``axes.figure`` is the
+figure.
 
 =============================  =====================================================================
 of a frame                     shows
@@ -19,7 +20,7 @@ of a frame                     shows
 =============================  =====================================================================
 of a detector or a camera      shows
 =============================  =====================================================================
-`plot_focal_plane`             the distortion of all detectors where they stand
+`plot_focal_plane`             the distortion of all detectors in the focal plane
 `plot_before_after`            residuals before and after the calibration, with their profiles
 `plot_slices`                  mean residuals in slices of the detector, several solutions together
 `plot_weights`                 distributions with each of the radial weights

@@ -21,7 +21,7 @@ class Arrows:
     typical : float
         Residual whose arrow is as long as a cell, px.
     magnification : float
-        Length of an arrow over the residual that it stands for.
+        Ratio of the length of an arrow to its residual.
     rms : float
         Root mean square of the cell means, px.
     """

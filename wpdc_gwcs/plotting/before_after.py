@@ -41,16 +41,16 @@ def plot_before_after(
     image_shape : (int, int)
         Shape of the detector, ``(ny, nx)``.
     axes : two `matplotlib.axes.Axes`, optional
-        Whose places are shared by the maps and, above and to the right of them, their profiles.
-        New ones if not given.
+        Their areas are divided between the maps and, above and to the right, their profiles.  New
+        ones if not given.
     n_bins : int, optional
         Cells along each side of the detector.
     titles : (str, str), optional
-        What stands over the two.
+        Titles of the two.
     n_points : int, optional
-        Stars in the profiles, at most: more would be a blot.
+        Largest number of stars in the profiles.
     seed : int, optional
-        Of their choice.
+        Seed for the choice of these stars.
 
     Returns
     -------

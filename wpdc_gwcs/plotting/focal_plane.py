@@ -1,4 +1,4 @@
-"""The distortion of all detectors of a camera where they stand in the focal plane."""
+"""The distortion of all detectors of a camera in the focal plane."""
 
 import numpy as np
 
@@ -12,20 +12,20 @@ _LONGEST = 2.5
 
 
 def plot_focal_plane(detectors, *, axes=None, n_arrows=8, magnification=None):
-    """Draw the distortion of all detectors of a camera as arrows, where the detectors stand.
+    """Draw the distortion of all detectors of a camera as arrows in the focal plane.
 
     Parameters
     ----------
     detectors : Camera or iterable of Calibration
-        The camera, or one calibrated frame of each detector, all of one exposure or of pointings
-        that are told by nothing but the detectors' places.
+        The camera, or one calibrated frame of each detector, all of the same exposure or with the
+        same pointing of the camera.
     axes : `matplotlib.axes.Axes`, optional
         Where it goes; new ones if not given.
     n_arrows : int, optional
         Arrows along each side of a detector.
     magnification : float, optional
-        Length of the arrows over the distortion; the paper's is 10.  A round number by which they
-        do not cross, if not given.
+        Ratio of the length of the arrows to the distortion; 10 in the paper.  By default a round
+        number for which the arrows do not cross.
 
     Returns
     -------
@@ -39,8 +39,8 @@ def plot_focal_plane(detectors, *, axes=None, n_arrows=8, magnification=None):
 
     Notes
     -----
-    An arrow begins where the pixel would be without distortion, in the linear part of the solution
-    about its reference point, and shows to where the whole solution puts it.
+    An arrow starts at the position of the pixel without distortion, by the linear part of the
+    solution about its reference point, and ends at the position by the whole solution.
 
     References
     ----------

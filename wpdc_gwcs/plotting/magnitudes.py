@@ -131,7 +131,7 @@ def plot_magnitude(matches, *, axes=None, width=0.5):
 
 
 def plot_centroids(residuals, *, limit=None, axes=None, width=0.5):
-    """Draw centroid errors against magnitude, and what photons allow.
+    """Draw centroid errors against magnitude, and the photon limit.
 
     Parameters
     ----------
@@ -140,8 +140,8 @@ def plot_centroids(residuals, *, limit=None, axes=None, width=0.5):
         ``phot_g_mean_mag``, ``magnitude`` or ``mag``; ``x_err`` and ``y_err``, px, are drawn as
         stated errors if there.
     limit : (mag, sigma), optional
-        Magnitudes and the photon limit of the centroid error of one axis there, px: a curve, or the
-        limits of single stars, whose medians are taken bin by bin.
+        Magnitudes and the photon limit of the centroid error along one axis, px: a curve, or the
+        limits of single stars, whose medians in bins are drawn.
     axes : three `matplotlib.axes.Axes`, optional
         Where dx, dy and their scatter go; new ones if not given.
     width : float, optional

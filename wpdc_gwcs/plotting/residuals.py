@@ -33,14 +33,14 @@ def plot_residual_arrows(x, y, dx, dy, *, image_shape, title=None, n_bins=20):
     image_shape : (int, int)
         Shape of the detector, ``(ny, nx)``.
     title : str, optional
-        What the arrows are.
+        Title of the figure.
     n_bins : int, optional
         Cells along each side of the detector.
 
     Returns
     -------
     `matplotlib.figure.Figure`
-        The figure: one arrow per cell that has stars, and the length of the arrow beside it as key.
+        One arrow per cell that has stars, and a key for the length of the arrows.
 
     Examples
     --------
@@ -74,7 +74,7 @@ def plot_residuals_vs_position(matches):
     -------
     `matplotlib.figure.Figure`
         Four panels.  Stars of the fit and held-out stars have their own colors, stars that are
-        neither (clipped) are grey; the line is the running median of the first two and the band
+        neither (clipped) are gray; the line is the running median of the first two and the band
         holds the middle 68 % of them.
     """
     x, y, dx, dy = get_columns(matches)

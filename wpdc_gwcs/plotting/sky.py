@@ -36,12 +36,12 @@ def plot_sky_offsets(matches, *, axes=None, limit=None, title=None):
         source, in deg, as in ``matches.ecsv``; ``used`` and ``holdout`` if there.  Tables of
         several exposures are pooled.
     axes : `matplotlib.axes.Axes`, optional
-        Whose place is shared by the offsets and, above and to the right, their histograms.  New
+        Its area is divided between the offsets and, above and to the right, their histograms.  New
         ones if not given.
     limit : float, optional
-        Half the range that is shown, mas; five times the scatter, with the mean, if not given.
+        Half of the range that is shown, mas; by default five times the scatter, plus the mean.
     title : str, optional
-        What the offsets are.
+        Title of the figure.
 
     Returns
     -------

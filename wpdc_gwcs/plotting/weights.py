@@ -85,6 +85,8 @@ def _draw(axes, results, name, limit):
         )
     axes.set_xlim(-limit, limit)
     axes.set_ylim(0, 1)
+    # Few enough for labels such as -0.075 to stand apart.
+    axes.locator_params(axis="x", nbins=5)
     axes.set_xlabel(_COMPONENTS[name])
     axes.legend(
         loc="upper left", edgecolor="none", framealpha=0.9, fontsize="small", title="d80",

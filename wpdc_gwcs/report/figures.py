@@ -1,4 +1,4 @@
-"""Figures of the page, as small as they can be and still be read."""
+"""Figures of the page, in small files."""
 
 import base64
 import io
@@ -17,7 +17,7 @@ _MOST_STARS, _MOST_STARS_SMALL = 4000, 700
 
 
 def detector_figures(name, solution, table, *, small=False):
-    """Draw what all frames of a detector show together.
+    """Draw the pooled results of all frames of a detector.
 
     Parameters
     ----------

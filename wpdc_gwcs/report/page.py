@@ -67,22 +67,23 @@ def write_report(summary, solutions, matches, file, *, title="Calibration report
         Detector name to `DistortionSolution`.  Frames of other detectors have no map.
     matches : mapping
         Frame name to match table (``x``, ``y``, ``dx``, ``dy``, ``used``, ``holdout``), of the
-        frames that were solved, whatever they lack.  Tables are asked for when they are needed,
-        and not kept: they may be read then.
+        frames that were solved or degraded.  Tables are requested when they are needed and not
+        kept, so they can be read then.
     file : text file object
         Where the page goes.
     title : str, optional
         Heading of the page.
     about : dict, optional
-        What the run was, heading to names and values, such as ``{"settings": {"degree": "auto"}}``;
-        the settings of the solutions if not given.
+        Description of the run, headings to names and values, such as
+        ``{"settings": {"degree": "auto"}}``; the settings of the solutions if not given.
 
     Notes
     -----
-    Everything is in the one page: it can be mailed, and opened without a network.  Frames are
-    folded; 72 of them make less than 3 MB, of one detector or of 72.  Of a survey, 100 frames of
-    each detector are pooled, evenly chosen; the tables have the 500 frames that failed, are
-    degraded or have the largest residuals, and the worst 100 of them have figures.
+    The page contains everything, so it can be sent by mail and opened without a network.  The
+    sections of the frames are collapsed.  72 frames need less than 3 MB, for one detector or for
+    72.  For a survey, 100 frames of each detector, chosen evenly, are pooled.  The tables have the
+    500 frames that failed, are degraded or have the largest residuals, and the worst 100 of them
+    have figures.
     """
     from jinja2 import Environment
 

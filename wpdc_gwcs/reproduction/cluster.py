@@ -15,6 +15,7 @@ from astropy.coordinates import SkyCoord
 from wpdc_gwcs.calibration import Settings, calibrate
 from wpdc_gwcs.evaluation import Cuts, evaluate, pool_residuals, pool_scores
 from wpdc_gwcs.plotting import plot_magnitude, plot_residual_maps
+from wpdc_gwcs.reproduction.centroids import photon_limit
 from wpdc_gwcs.reproduction.detectors import METHODS
 from wpdc_gwcs.reproduction.results import tabulate_results
 from wpdc_gwcs.reproduction.scale import SEED
@@ -52,7 +53,8 @@ def reproduce_cluster(folder, scale, *, seed=SEED, jobs=1, progress=None):
     -------
     `~astropy.table.QTable`
         See `~wpdc_gwcs.reproduction.results.tabulate_results`.  ``sigma_dx`` is after 3-sigma
-        clipping, ``raw_sigma_dx`` before it.
+        clipping, ``raw_sigma_dx`` before it; ``photon_limit`` and ``raw_photon_limit`` are what the
+        same two would be if centroids had no other error than that of photons, sky and read noise.
 
     Notes
     -----
@@ -121,6 +123,12 @@ def _quantities(simulation, run, cuts):
         np.concatenate([np.asarray(t[name], float) for t in tables])
         for name in ("phot_g_mean_mag", "dx", "dy")
     )
+    camera = simulation.camera
+    limit = photon_limit(camera, camera.detectors[0], magnitude)
+    # Clipping a sum of Gaussians has no closed form: drawn, the same in each call.
+    drawn = evaluate(*np.random.default_rng(0).normal(size=(2, limit.size)) * limit)
+    found[_DETECTOR, "photon_limit", "pix"] = np.hypot(drawn.sigma_dx, drawn.sigma_dy) / np.sqrt(2)
+    found[_DETECTOR, "raw_photon_limit", "pix"] = float(np.sqrt(np.mean(limit**2)))
     for middle in _MAGNITUDES:
         inside = np.abs(magnitude - middle) <= _WIDTH / 2
         s = evaluate(dx[inside], dy[inside])

@@ -95,6 +95,8 @@ def _quantities(pooled, score):
     return {
         **{(name, "pix"): getattr(s, name) for name in moments},
         ("wcs_rms", "pix"): score.wcs_rms,
+        # What all exposures have in common: the rest is the noise of the numbers of each of them.
+        ("wcs_rms_static", "pix"): score.wcs_rms_static,
         ("wcs_max", "pix"): score.wcs_max,
         ("share_below_0p01", ""): score.share_below,
         # The paper knows no truth: it counts the cells of its map whose mean residual is short.

@@ -24,7 +24,7 @@ class SimulatedDetector:
         Its distortion, in its own pixels.
     center : (float, float), optional
         Where headers say that its center is, in px of the focal plane from the point where the
-        camera points; x against right ascension and y towards north where the camera is not turned.
+        camera points; x against right ascension and y toward north where the camera is not turned.
     offset : (float, float), optional
         How far its center truly is from there, px.
     axes : (int, int), optional

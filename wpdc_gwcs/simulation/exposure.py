@@ -266,7 +266,7 @@ class SimulatedExposure(FrameTruth):
         _, seed, place = self._streams
         rng = np.random.Generator(np.random.PCG64(seed).jumped(place))
         galaxies = self._measurement.galaxies if galaxies is None else galaxies
-        # The background is a little brighter towards one side, as it is in practice.
+        # The background is a little brighter toward one side, as it is in practice.
         image = np.empty((ny, nx))
         image[:] = camera.background * (1 + 0.05 * (np.arange(nx) / nx - 0.5))
         x, y = self.stars["x"].data, self.stars["y"].data

@@ -69,7 +69,7 @@ class StarField:
         Columns ``ra``, ``dec``, ``pmra``, ``pmdec``, ``magnitude``, ``reference_index`` and perhaps
         ``color``, at the epoch of the catalog.
     vectors : (3, N) ndarray
-        Unit vectors towards them.
+        Unit vectors toward them.
     """
 
     stars: object
@@ -140,7 +140,7 @@ def simulate(
     colors : (float, float), optional
         Mean and scatter of the stars' colors; without them the catalog has none.
     refraction : `~astropy.units.Quantity`, optional
-        Shift of stars towards the zenith per magnitude of color, which is somewhere else for each
+        Shift of stars toward the zenith per magnitude of color, which is somewhere else for each
         exposure.
     lateral_color : `~astropy.units.Quantity`, optional
         Shift of stars away from where the camera points per magnitude of color, at the farthest

@@ -183,7 +183,7 @@ def _with_optics(places, shape, distortion, waves, seed):
     for place, rng in zip(places.values(), streams[1:], strict=True):
         x, y = np.subtract(axis, place["center"]) * place.get("axes", (1, 1)) / half
         one = Distortion.off_axis(shape, complex(x, y), quintic=quintic, rng=rng)
-        # What is a detector's own grows towards the rim with what is common.
+        # What is a detector's own grows toward the rim with what is common.
         own = (max(np.hypot(x, y), 1.0) / _TERMS_AT) ** 1.5
         drawn.append(replace(one, terms={key: own * c for key, c in one.terms.items()}))
     gain = distortion / max(one.greatest() for one in drawn)

@@ -85,30 +85,30 @@ def solve(
         Reference point, px, zero based; the center of the detector, or that of ``solution``, if not
         given.
     cd : (2, 2) array_like, optional
-        Nominal matrix CD0 in which the polynomial of a single detector stands, deg / px; the mean
-        of the solved ones if not given.
+        Nominal matrix CD0 used by the polynomial of a single detector, deg / px; the mean of the
+        solved ones if not given.
     weight : RadialWeight or dict, optional
-        Radial weight of the delivered polynomial; ``exp-sqrt`` with 0.87 times half the shorter
-        side if not given, and uniform with ``lut="none"``, where no table mends an extrapolation.
+        Radial weight of the stored polynomial; by default ``exp-sqrt`` with 0.87 times half the
+        shorter side, or uniform with ``lut="none"``, where no table corrects an extrapolation.
     degree : int or 'auto', optional
-        Degree of the delivered polynomial, and the largest degree of a detector's own distortion.
-        ``auto``: up to 7 by evidence, delivered as a cubic and a table.
+        Degree of the stored polynomial, and the highest degree of the distortion of a detector.
+        ``auto``: up to 7 by evidence, stored as a cubic and a table.
     n_grid : int, optional
         Nodes of the look-up table along each axis.
     lut : {'auto', 'always', 'none'}, optional
-        Whether residuals are smoothed into a table; ``auto`` asks the data.  ``none`` delivers the
-        polynomial alone.
+        Whether residuals are smoothed into a table; ``auto`` decides from the data.  ``none`` gives
+        the polynomial alone.
     refine : {'auto', 'attitude', 'field', 'pv'}, optional
-        What an exposure has of its own: six linear numbers (``attitude``), also a smooth field
-        where its evidence is there (``auto``) or in any case (``field``), or a polynomial of its
-        own (``pv``, the paper's way).
+        What is fitted for each exposure: six linear numbers (``attitude``), also a smooth field if
+        there is evidence for it (``auto``) or always (``field``), or a polynomial (``pv``, as in
+        the paper).
     solution : DistortionSolution or dict, optional
         Stored instrument, or one for each detector by its name.
     update : bool, optional
-        Add the residuals of these exposures to those of ``solution`` and make its table anew.
+        Add the residuals of these exposures to those of ``solution`` and make a new table.
     pool_attitudes : bool, optional
-        Let five or more exposures tell how much scale, rotation and skew really vary between them,
-        and draw each exposure's towards their mean accordingly.
+        Estimate from five or more exposures how much scale, rotation and skew vary between them,
+        and draw those of each exposure toward their mean accordingly.
     clip : float, optional
         Pairs with residuals of more than this many robust standard deviations are left out.
     table_choice : dict, optional
@@ -132,16 +132,16 @@ def solve(
     Notes
     -----
     The residual of a pair is a sum of linear terms (`wpdc_gwcs.solve.terms`), each with a Gaussian
-    prior whose variance is learnt:
+    prior whose variance is learned:
 
     .. math:: r = \Phi(x) w + O(\varphi) o + B(\varphi) a_e + \delta_e(\varphi) + noise
 
-    1. All terms but the fields are solved at once, with the variance of every degree; outliers are
-       judged by what the other stars predict.
-    2. What is left on the detector, pooled over exposures, becomes its table.
-    3. Each exposure gets the field that its evidence speaks for; the shared terms are solved again
-       with the fields marginalized, tables and fields once more.
-    4. The whole is written down as PV polynomial, table, attitude, and a table of the exposure.
+    1. All terms except the fields are solved together, with the variance of every degree.
+       Outliers are judged by the prediction from the other stars.
+    2. The remaining residuals of each detector, pooled over exposures, become its table.
+    3. Each exposure gets a field if there is evidence for it.  The shared terms are solved again
+       with the fields marginalized, and then tables and fields once more.
+    4. The result is stored as PV polynomial, table, attitude, and a table of the exposure.
 
     References
     ----------

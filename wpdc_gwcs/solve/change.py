@@ -24,7 +24,7 @@ _MOST_WAVES, _STARS_PER_WAVE = 120, 2
 # Log evidence that a change must have beyond that of the exposures' own fields, nats.
 AGAINST_CHANGE = 3.0
 
-# What is learnt about a change's spectrum beyond that (two numbers): a false alarm is then rarer
+# What is learned about a change's spectrum beyond that (two numbers): a false alarm is then rarer
 # than one in a thousand.
 _LEAST_GAIN = 3.0
 

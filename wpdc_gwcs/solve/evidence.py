@@ -1,4 +1,4 @@
-"""Variances of groups of coefficients, learnt from the coefficients and their covariance."""
+"""Variances of groups of coefficients, learned from the coefficients and their covariance."""
 
 import numpy as np
 

@@ -29,10 +29,10 @@ _STEPS_WAVES = 98
 # share, in more detail than a field.
 _TABLE_ALONE = 6000
 
-# Waves of what the exposures of a detector share, and stars that its spectrum is learnt from.
+# Waves of what the exposures of a detector share, and stars that its spectrum is learned from.
 _MOST_STATIC, _STARS_POOLED = 300, 10_000
 
-# Frames of an exposure that its spectrum is learnt from, those with the most stars.
+# Frames of an exposure that its spectrum is learned from, those with the most stars.
 _FRAMES_PER_EXPOSURE = 6
 
 # Largest outer scale in units of the patch; of one exposure alone, whose polynomial is free, the
@@ -171,8 +171,8 @@ def with_statics(o, state):
     """State with the smooth structure of each detector that its exposures share.
 
     The waves that stand out, see `fit_waves`, and where there are not enough stars for a table, a
-    field of what else there is.  Its spectrum is learnt from all detectors: what one of them cannot
-    tell of its own few stars, the others tell of its kind.
+    field for the remaining structure.  Its spectrum is learned from all detectors, because one
+    detector alone may have too few stars.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ class Detector:
         return 2 * (x - self.center[0]) / nx, 2 * (y - self.center[1]) / ny
 
     def contains(self, x, y):
-        """Tell which pixels lie on the detector; NaN does not.
+        """Return which pixels are on the detector; NaN is not.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class Observations:
     has_errors, valid, finite : (N,) ndarray of bool
         Errors were stated; the pair may be fitted; it gets a residual.
     color : (N,) ndarray
-        Color of the star less that of the reference, 0 where unknown.
+        Color of the star minus the reference color, 0 where unknown.
     reference_color : float
         Median color; NaN where there are no colors.
     """

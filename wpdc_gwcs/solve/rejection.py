@@ -27,7 +27,7 @@ _ALIEN_RATIO, _ALIEN_SCATTER, _LINEAR_TERMS = 10.0, 50.0, 6
 def without_aliens(o, state):
     """Leave out frames whose pairs no linear map brings near those of the others.
 
-    One of them would draw the polynomial of all towards itself.
+    One of them would draw the polynomial of all toward itself.
 
     Parameters
     ----------

@@ -147,7 +147,7 @@ def inherited(o, state, k):
 
 
 def _behind(o, state, k):
-    """Mark the pairs that a detector's distortion was learnt from."""
+    """Mark the pairs that a detector's distortion was learned from."""
     behind = np.zeros(len(o), bool)
     for f in state.active:
         if o.detector_of[f] == k:

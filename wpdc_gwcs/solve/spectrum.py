@@ -25,7 +25,7 @@ _LOG_AMPLITUDE_SCATTER = 1.0
 _LOG_SCALE_SCATTER = 0.7
 _LOG_STRETCH_SCATTER = 0.5
 
-# Exposures, and frames of each, that the pooled spectrum is learnt from.
+# Exposures, and frames of each, that the pooled spectrum is learned from.
 _EXPOSURES_POOLED, _FRAMES_POOLED = 8, 2
 
 # Gain in log evidence that fields must bring to all exposures together, and what more must add: a

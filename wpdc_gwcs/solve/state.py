@@ -33,13 +33,13 @@ _MAX_POOLED = 0.05
 # Frames of more stars than this have no star that the model follows.
 _MAX_STARS_LEVERAGE = 200
 
-# Standard deviations are not learnt to be smaller, px: of any group, of color terms per magnitude.
+# Standard deviations are not learned to be smaller, px: of any group, of color terms per magnitude.
 _LEAST_SIGMA, _LEAST_COLOR = 1e-9, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where a solution stands.
+    """The state of a solution.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def linear_step(o, state, *, learn=10, pool=True):
     learn : int, optional
         Steps of expectation maximization of the variances.
     pool : bool, optional
-        Whether attitudes are drawn towards their mean by as much as they vary.
+        Whether attitudes are drawn toward their mean by as much as they vary.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""A stored solution: the instrument as a table of a model, and how new exposures change it.
+"""A stored solution as a table of the model, and its update by new exposures.
 
 ::
 
@@ -23,7 +23,7 @@ __all__ = ["StoredMap", "unswallowed_maps", "updated_solution"]
 
 @dataclass(frozen=True, eq=False)
 class StoredMap:
-    """Displacements that a stored solution subtracts: pixel less undistorted pixel.
+    """Displacements that a stored solution subtracts: pixel minus undistorted pixel.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def change_on(o, state, k, change, x, y):
 
 
 def updated_solution(o, state, k, change, solution, new, n_grid):
-    """Add the residuals of new exposures to a stored solution, and make its table anew.
+    """Add the residuals of new exposures to a stored solution, and make a new table.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The terms of a solution: linear displacements of the focal plane, with priors that are learnt.
+"""The terms of a solution: linear displacements of the focal plane, with priors that are learned.
 
 A term is plain data: a name, a scope, its shapes and the group of each coefficient.  The solver
 knows scopes (camera, detector, exposure) and groups, not names: a new term is one more function
@@ -60,7 +60,7 @@ class Term:
     groups : (K,) ndarray of int
         Group of each coefficient: the coefficients of one group share a variance.
     start : (G,) ndarray
-        Standard deviation of each group before anything is learnt, px.
+        Standard deviation of each group before anything is learned, px.
     decay : float
         Factor by which a group is expected to be smaller than the one before, where there is a
         sequence of them (degrees); 0 for groups of their own.
@@ -132,8 +132,8 @@ class Term:
 # How much smaller a degree of a polynomial is expected to be than the degree before it.
 _DECAY = 1.8
 
-# Broad starts, px: what is learnt replaces them.  Distortion of degree 2 of one detector alone, and
-# of a detector in a mosaic, whose optics take the most; optics; shift and turn of a detector.
+# Broad starts, px: what is learned replaces them.  Distortion of degree 2 of one detector alone,
+# and of a detector in a mosaic, whose optics take the most; optics; shift and turn of a detector.
 _START, _START_MOSAIC, _START_OPTICS, _START_PLACE = 100.0, 3.0, 300.0, 10.0
 
 # The same of terms in color, px per magnitude.

@@ -41,7 +41,7 @@ _OUTERMOST = CubicSpline(np.arange(_NODES), np.eye(_NODES)[0])
 # quarter of a coefficient for each ten candidates remains, in units of its error.
 _FLOOR, _GUESS_WEIGHT = 0.02, 1.0
 
-# Steps of the variances, by then they move by a few per cent.
+# Steps of the variances, by then they move by a few percent.
 _STEPS = 8
 
 # Times that the step of the wave numbers is halved about those waves of which the stars determine
