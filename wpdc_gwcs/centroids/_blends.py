@@ -16,7 +16,7 @@ _CHUNK = 4000
 # hundred exceed by noise, of any profile.  Where its share of the light is known better than the
 # next number, it is that times the fourth root of how much better: companions of a bright star show
 # far beyond, and bright stars are few.
-_MAX_COMPANION, _KNOWN = 2.9, 0.017
+_MAX_COMPANION, _KNOWN = 3.0, 0.017
 # Stars nearest in place, and the best measured of all, that tell how profiles differ.
 _NEAREST, _BEST = 25, 300
 _LEAST = 20
