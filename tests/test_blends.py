@@ -99,6 +99,21 @@ def test_stars_of_many_colors_are_not_taken_for_pairs():
     assert 1.4826 * np.median(np.abs(pulls[np.tile(clean, 2)])) == pytest.approx(1, abs=0.12)
 
 
+def test_a_part_of_the_frame_is_judged_by_its_own_stars():
+    """The best measured stars are all elsewhere, and the PSF does not follow in a corner."""
+    rng = np.random.default_rng(5)
+    x, y = grid(rng, step=17)
+    corner = (x > 550) & (y < 350)
+    bright = (x < 450) & (y > 300)
+    flux = np.where(bright, 10 ** rng.uniform(5.3, 5.8, x.size), 10 ** rng.uniform(4, 5, x.size))
+    bump = np.exp(-((x - 750) ** 2 + (y - 150) ** 2) / (2 * 200**2))
+    table = measure(draw(x, y, flux, SIGMA * (1 + 0.06 * bump)), rng)
+    found, distance = nearest(table, x, y)
+    broad = np.asarray(found["flags"]) & FLAG_EXTENDED > 0
+    assert distance.max() < 0.5
+    assert broad[corner].mean() < 0.15
+
+
 def test_rings_are_no_blends():
     """Light between two rings that touch is not that of a Gaussian's wings."""
     rng = np.random.default_rng(4)

@@ -20,6 +20,8 @@ _MAX_COMPANION, _KNOWN = 3.0, 0.017
 # Stars nearest in place, and the best measured of all, that tell how profiles differ.
 _NEAREST, _BEST = 25, 300
 _LEAST = 20
+# Parts along each axis, from which they come in turn.
+_PARTS = 6
 # Variance of a median over that of a mean.
 _MEDIAN_COST = 1.57
 # Outliers, in median absolute widths; and so few that both sides are needed.
@@ -143,9 +145,7 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     covariance = inverses(left)
     amplitude = np.einsum("sij,sj->si", covariance, right)
     before = np.einsum("si,sij,sj->s", amplitude, left, amplitude)
-    size = covariance[clean].trace(axis1=1, axis2=2)
-    best = clean[np.argsort(np.where(size > 0, size, np.inf))]
-    best = best[: int(np.clip(len(best) // 4, _LEAST, _BEST))]
+    best = _best_everywhere(stars, clean, covariance[clean].trace(axis1=1, axis2=2))
     common, unsure = _common(stars, amplitude, covariance, best)
     amplitude -= common
     narrower = amplitude[best] @ changes.mean(axis=1) <= 0
@@ -170,6 +170,24 @@ def _normal(field, profile, noise, stars, modes, *, radius, subtracted):
         field, profile, noise, stars, modes, radius, subtracted=subtracted, robust=False
     )
     return left, right, np.maximum(use.sum(axis=1) - 3, 1)
+
+
+def _best_everywhere(stars, clean, size):
+    """Rows of the best measured stars, as many from each part of the frame as there are.
+
+    The best of all may be in one cluster, and tell nothing of a corner.
+    """
+    places = np.column_stack([stars.x, stars.y])[clean]
+    low, high = places.min(axis=0), places.max(axis=0)
+    cells = (_PARTS * (places - low) / np.maximum(high - low, 1e-9) * (1 - 1e-9)).astype(int)
+    cell = cells[:, 0] * _PARTS + cells[:, 1]
+    size = np.where(size > 0, size, np.inf)
+    order = np.lexsort([size, cell])
+    _, first, count = np.unique(cell[order], return_index=True, return_counts=True)
+    rank = np.empty(len(clean), int)
+    rank[order] = np.arange(len(clean)) - np.repeat(first, count)
+    n = int(np.clip(len(clean) // 4, _LEAST, _BEST))
+    return clean[np.lexsort([size, rank])[:n]]
 
 
 def _common(stars, amplitude, covariance, best):
