@@ -12,11 +12,11 @@ __all__ = ["judge_profiles", "weigh_neighbors"]
 # Stars at a time: bounds the memory for their pixels.
 _CHUNK = 4000
 
-# Significance in sigma of the companion that is the most significant one, which two stars in a
+# Significance in sigma of the companion that is the most significant one, which one star in a
 # hundred exceed by noise, of any profile.  Where its share of the light is known better than the
 # next number, it is that times the fourth root of how much better: companions of a bright star show
 # far beyond, and bright stars are few.
-_MAX_COMPANION, _KNOWN = 3.0, 0.017
+_MAX_COMPANION, _KNOWN = 3.15, 0.017
 # Stars nearest in place, and the best measured of all, that tell how profiles differ.
 _NEAREST, _BEST = 25, 300
 _LEAST = 20
