@@ -30,8 +30,9 @@ __all__ = ["TpvFit", "fit_tpv", "fold_polynomial", "nearest_polynomial", "refit"
 
 # A fit this good (px) is good enough; a higher degree would only be harder to read.
 _ENOUGH_PX = 1e-3
-# Where none is, the lowest degree that is as good as the best but for so much.
-_NEARLY = 1.1
+# Where none is, the lowest degree that is as good as the best but for so much; and how much more is
+# nearly as good to SWarp.
+_AS_GOOD, _NEARLY = 1.02, 1.1
 _DEGREES = range(1, 8)
 # Nodes along each axis of the table of what a polynomial leaves, where there was none.
 _TABLE_NODES = 50
@@ -190,7 +191,7 @@ def nearest_polynomial(obj, degree=None):
         weights = levelling_weights(pixels, np.linalg.solve(exact.cd, plane), n)
         trials[-1] = min(trials[-1], _trial(obj, _fit(u, plane, n, weights)), key=lambda t: t[0])
     best = min(worst for worst, _ in trials)
-    limit = max(_NEARLY * best, _ENOUGH_PX)
+    limit = max(_AS_GOOD * best, _ENOUGH_PX)
     pv = next(pv for worst, pv in trials if worst <= limit)
     return pv, _tpv_deviation(obj, pv)
 
