@@ -14,9 +14,9 @@ from numpy.polynomial import chebyshev
 
 __all__ = ["levelling_weights"]
 
-_POWER = 0.7
-# Nearly all is gained in the first dozen rounds, and nothing after thirty.
-_ROUNDS = 30
+_POWER = 0.5
+# Nearly all is gained in the first dozen rounds, and nothing after forty.
+_ROUNDS = 40
 # What the worst place gains must not cost all others more than this factor in their mean square.
 _MOST_RMS = 1.5
 
