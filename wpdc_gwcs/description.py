@@ -125,7 +125,8 @@ def _of_solution(solution):
     lines.append(("valid", solution.validity))
     inputs = solution.provenance.get("inputs") or ()
     if len(inputs):
-        lines.append(("made of", f"{len(inputs)} frames, {solution.provenance.get('created')}"))
+        frames = f"{len(inputs)} frame{'' if len(inputs) == 1 else 's'}"
+        lines.append(("made of", f"{frames}, {solution.provenance.get('created')}"))
     return lines
 
 
