@@ -274,7 +274,7 @@ class TestPaths:
         assert expand_paths(["?.fits[SCI]"]) == ["b.fits[SCI]"]
         assert expand_paths(["*.f*"], without=["gaia.fits"]) == ["a.fits.fz", "b.fits", "f[1].fits"]
         assert expand_paths(["f[1*"]) == ["f[1].fits"]
-        with pytest.raises(InputError, match="x.*: no file fits this pattern"):
+        with pytest.raises(InputError, match="x.*: no file matches this pattern"):
             expand_paths(["x*"])
         (folder / "odd*.fits").touch()
         assert expand_paths(["odd*.fits[1]"]) == ["odd*.fits[1]"]

@@ -110,7 +110,9 @@ def test_detectors_of_another_camera_fail_each_with_its_reason(stars, catalog, p
     frames = [replace(f, detector="X" + f.detector) for f in make_frames(stars, EXPOSURES[:1])]
     run = calibrate(frames, catalog, solution=read(path))
     assert len(run.failures) == 6
-    assert "is of detector 'XC0', the stored solutions are of 'C0', " in str(run.failures["e0_C0"])
+    assert "is from detector 'XC0', the stored solutions are for 'C0', " in str(
+        run.failures["e0_C0"]
+    )
     assert list(run.summary["status"]) == ["failed"] * 6
     frames = [replace(f, image_shape=(700, 800)) for f in make_frames(stars, EXPOSURES[:1])]
     run = calibrate(frames, catalog, solution=read(path))
@@ -125,7 +127,7 @@ def test_several_files_are_one_camera(solved, path):
     assert set(found) == {"C0", "C1"}
     assert stored_solutions(names[:1]).detector == "C0"
     assert stored_solutions([]) is None
-    with pytest.raises(InputError, match="detector 'C0' has a solution in .* already"):
+    with pytest.raises(InputError, match="detector 'C0' already has a solution, in "):
         stored_solutions([path, names[0]])
     write(run.calibrations[0], folder / "frame.asdf", overwrite=True)
     with pytest.raises(InputError, match=r"needs a \*.solution.asdf or \*.camera.asdf file"):

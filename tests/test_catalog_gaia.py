@@ -225,7 +225,7 @@ def test_what_is_kept_needs_no_network_and_what_is_broken_is_asked_again(tmp_pat
     with pytest.raises(CatalogError) as problem:
         read_catalog(archive, region=Region(200, 0, 0.1))
     message = str(problem.value)
-    assert "does not answer, in 3 tries" in message
+    assert "did not answer in 3 tries" in message
     assert "wpdc catalog prepare gaia" in message
     assert "--tap-url" in message
     assert "\n" not in message
@@ -235,9 +235,9 @@ def test_what_is_kept_needs_no_network_and_what_is_broken_is_asked_again(tmp_pat
     ("manners", "message"),
     [
         ({"refuse": "quota of anonymous users"}, "refuses the query: .*quota of anonymous"),
-        ({"overflow": True}, "does not give all stars of a cell"),
-        ({"lacks": "pmra"}, "does not give the columns pmra"),
-        ({"failures": 99}, "does not answer, in 3 tries: .*503"),
+        ({"overflow": True}, "does not return all stars of a cell"),
+        ({"lacks": "pmra"}, "does not return the columns pmra"),
+        ({"failures": 99}, "did not answer in 3 tries: .*503"),
     ],
 )
 def test_services_that_do_not_serve(tmp_path, manners, message):
@@ -253,7 +253,7 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, caplog):
     with standing_in(gaia_like()) as service:
         found = read_catalog(GaiaArchive(url=service.url, cache=tmp_path), region=REGION)
     assert len(found) > 30
-    assert "cannot be kept" in caplog.text
+    assert "cannot be cached" in caplog.text
 
 
 def test_environment_names_service_and_folder(tmp_path, monkeypatch):

@@ -331,7 +331,7 @@ def test_partitions_at_poles_and_corners(tmp_path, center):
 
 
 def test_hats_that_is_none(tmp_path):
-    with pytest.raises(CatalogError, match="must be the folder of a catalog, is none"):
+    with pytest.raises(CatalogError, match="must be the folder of a catalog, is not a folder"):
         read_catalog(f"hats:{tmp_path / 'nowhere'}", region=REGION)
     with pytest.raises(CatalogError, match="hats.properties"):
         read_catalog(f"hats:{tmp_path}", region=REGION)

@@ -307,7 +307,9 @@ class TestBadInput:
 
     def test_no_rows(self, tmp_path):
         stars()[:0].write(tmp_path / "a.fits")
-        with pytest.raises(CatalogError, match=r"a.fits: catalog must have rows, has 0"):
+        with pytest.raises(
+            CatalogError, match=r"a.fits: catalog must have at least one row, has 0"
+        ):
             read_catalog(tmp_path / "a.fits")
 
     def test_no_positions(self):
@@ -315,7 +317,7 @@ class TestBadInput:
             read_catalog(Table({"a": [1.0], "b": [2.0]}))
 
     def test_all_nan(self):
-        with pytest.raises(CatalogError, match="none of 2 has"):
+        with pytest.raises(CatalogError, match="none of 2 rows has"):
             read_catalog(Table({"ra": [np.nan, 1.0], "dec": [1.0, np.nan]}))
 
     @pytest.mark.parametrize(("column", "unit"), [("pmra", "deg"), ("parallax", "s")])
@@ -873,7 +875,7 @@ class TestCopies:
     def test_by_identifier(self, rng, share):
         table = cluster(rng)
         again = table[rng.random(len(table)) < share]
-        with pytest.warns(WPDCWarning, match=f"{len(again)} of {400 + len(again)} rows are"):
+        with pytest.warns(WPDCWarning, match=f"{len(again)} of {400 + len(again)} rows repeat"):
             catalog = read_catalog(vstack([table, again]))
         assert catalog["catalog_index"].tolist() == list(range(400))
 
@@ -883,7 +885,7 @@ class TestCopies:
         again = table[:20].copy()
         again["ra"] += rng.normal(0, 0.2 / 3.6e6, 20)
         again["ra_error"] = 0.1
-        with pytest.warns(WPDCWarning, match="20 of 420 rows are further rows"):
+        with pytest.warns(WPDCWarning, match="20 of 420 rows repeat a star"):
             catalog = read_catalog(vstack([table, again]))
         # The more precise row of each star is kept.
         assert sorted(catalog["catalog_index"]) == list(range(20, 420))
@@ -901,7 +903,7 @@ class TestCopies:
         else:
             table.remove_column("phot_g_mean_mag")
             again.remove_column("phot_g_mean_mag")
-        with pytest.warns(WPDCWarning, match=r"rows are further rows of a star"):
+        with pytest.warns(WPDCWarning, match=r"rows repeat a star that another row has"):
             catalog = read_catalog(vstack([table, again]))
         # Without magnitudes, a star or two are as close to another one by chance.
         assert 400 - 2 * (not with_magnitudes) <= len(catalog) <= 400
@@ -966,7 +968,7 @@ class TestWhatFilesBring:
     @pytest.mark.parametrize("sentinel", [-999.0, 1e20, -9999.0])
     def test_row_out_of_range(self, sentinel):
         table = Table({"ra": [10.0, sentinel, 10.2], "dec": [-5.0, sentinel, -5.2]})
-        with pytest.warns(WPDCWarning, match="1 of 3 rows are left out: 1 out of range"):
+        with pytest.warns(WPDCWarning, match="1 of 3 rows left out: 1 out of range"):
             assert read_catalog(table)["catalog_index"].tolist() == [0, 2]
 
     def test_cell_that_is_no_number(self):
@@ -995,7 +997,7 @@ class TestWhatFilesBring:
     def test_radians_by_density(self, rng):
         table = cluster(rng)["ra", "dec"]
         radians = Table({c: np.radians(table[c]) for c in ("ra", "dec")})
-        with pytest.warns(WPDCWarning, match="no unit and are taken for radians"):
+        with pytest.warns(WPDCWarning, match="no unit and are taken to be radians"):
             catalog = read_catalog(radians)
         np.testing.assert_allclose(catalog["ra"], table["ra"], rtol=1e-12)
 

@@ -53,7 +53,7 @@ def test_prepare_keeps_what_the_rules_leave(tmp_path, two, capsys, ending):
         np.testing.assert_allclose(written[name][order], expected[name], rtol=1e-15)
     text = capsys.readouterr().out
     assert "2200  read" in text
-    assert "200  further rows of a star" in text
+    assert "200  repeated rows of a star" in text
     assert f"{good.sum()}  written to" in text
     assert run(["catalog", "prepare", paths[0], "--output", str(output)]) == 2
 
@@ -76,8 +76,8 @@ def test_a_box_across_right_ascension_zero(tmp_path, two):
         (["--cone", "1,99,1"], "--cone: a cone needs"),
         (["--box", "1,2,5,4"], "--box: a box needs"),
         (["--box", "1,2,3,4", "--cone", "1,2,3"], "only one of"),
-        (["--cone", "100,50,0.1"], "no star is left"),
-        (["--max-mag", "-5"], "no star is left"),
+        (["--cone", "100,50,0.1"], "no stars are left"),
+        (["--max-mag", "-5"], "no stars are left"),
         (["--around", "nowhere.fits"], "nowhere.fits"),
     ],
 )
@@ -96,7 +96,7 @@ def test_formats_and_places_that_are_needed(tmp_path, two, capsys):
     assert run(["catalog", "info", "gaia"]) == 2
     assert "name the part of the sky: --cone" in capsys.readouterr().err
     assert run(["catalog", "info", two[1][0], "--cone", "100,50,0.1"]) == 2
-    assert "no star in this part" in capsys.readouterr().err
+    assert "no stars in this part" in capsys.readouterr().err
 
 
 def test_info_tells_what_is_there(two, capsys):

@@ -29,7 +29,7 @@ def test_generic_as_it_always_was(tmp_path, capsys):
         f"{tmp_path}/sim-reference.fits --output results\n"
     )
     assert simulate(tmp_path, "--size", "128", "--exposures", "2") == 2
-    assert "sim-reference.fits exists" in capsys.readouterr().err
+    assert "sim-reference.fits: file exists" in capsys.readouterr().err
 
 
 def test_a_mosaic_with_everything(tmp_path, capsys):
@@ -105,7 +105,7 @@ def test_same_seed_same_files(tmp_path):
         (["--center", "nan,1"], "--center must be RA,DEC in deg, got 'nan,1'"),
         (["--center", "1,1", "--fields", "0"], "--fields must be at least 1, got 0"),
         (["--density", "a"], "--density must be numbers with ',' between them, got 'a'"),
-        (["--density", "9:1"], "--density LOW:HIGH must be positive and rise, got '9:1'"),
+        (["--density", "9:1"], "--density LOW:HIGH must be positive and increasing, got '9:1'"),
         (["--density", "1,2,3"], "density must be one number, or one for each field (1)"),
         (["--density", "-1"], "density must be not negative"),
         (["--size", "big"], "--size must be like 2048 or 4096x2048, got 'big'"),

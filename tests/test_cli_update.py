@@ -116,7 +116,7 @@ def test_solution_of_another_shape_is_refused(halves, tmp_path, capsys):
     assert status == 1
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1, lines
-    assert "shape (ny, nx) (900, 900), the stored solution is for (1000, 1024)" in lines[0]
+    assert "shape (ny, nx) (900, 900), the stored solution has (1000, 1024)" in lines[0]
     assert not list((tmp_path / "out").glob("*.asdf"))
 
 

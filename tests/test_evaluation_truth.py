@@ -131,7 +131,9 @@ def test_pooled_scores_tell_what_frames_share(straight):
 def test_score_of_another_detector(straight):
     calibration, stars = known(straight)
     other = simulate(1, image_shape=(300, 600), density=5, distortion=2).exposures[0]
-    with pytest.raises(ValueError, match=r"frame sim-01 must be of shape \(300, 600\)"):
+    with pytest.raises(
+        ValueError, match=r"frame sim-01 must have the shape of its truth, \(300, 600\)"
+    ):
         score_frame(calibration, other, stars)
     with pytest.raises(ValueError, match="score_frame needs a calibrated frame with its matches"):
         score_frame(replace(calibration, matches=None), straight, stars)
@@ -218,7 +220,7 @@ def test_evaluate_some_weights(results, tmp_path, capsys):
         (["--about", "1"], "--about must be 2 numbers with ',' between them, got '1'"),
         (["--region", "1,2,3"], "--region must be 4 numbers"),
         (["--min-radius", "9", "--max-radius", "2"], "radius must have its lower limit first"),
-        (["--min-mag", "30", "--no-weights"], "no star of 3 frames is within the limits given"),
+        (["--min-mag", "30", "--no-weights"], "no star of 3 frames is within the given limits"),
         (["--truth", "nowhere"], "nowhere/truth.asdf: no such file"),
     ],
 )

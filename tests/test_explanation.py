@@ -79,7 +79,7 @@ def test_a_frame_without_an_epoch_and_one_without_stars(sky):
     few = frame.load_sources()[:5]
     told = explain_frame(replace(frame, load_sources=lambda: few), sky.reference)
     assert told.status == "failed"
-    assert "5 of 5 sources take part" in told.stages[1].lines[0]
+    assert "5 of 5 sources used" in told.stages[1].lines[0]
     empty = replace(frame, load_sources=lambda: few[:0])
     told = explain_frame(empty, sky.reference)
     assert [s.name for s in told.stages] == ["frame", "sources"]
@@ -196,11 +196,11 @@ def test_advice_is_that_of_the_case(sky, what):
         expected = "a match was found with the header off by .*correct the header"
     elif what == "references":
         stars = Table(stars)[:5]
-        expected = "8 reference stars are needed, 5 are in reach"
+        expected = "8 reference stars are needed, and the catalog has 5 in reach"
     elif what == "sources":
         few = frame.load_sources()[:4]
         frame = replace(frame, load_sources=few.copy)
-        expected = "8 sources are needed, 4 take part: take fainter ones .*--solution"
+        expected = "8 sources are needed, 4 can be used: use fainter ones .*--solution"
     else:
         image = partial(np.full, frame.image_shape, 100.0)
         frame = replace(frame, load_sources=None, load_image=image)

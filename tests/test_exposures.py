@@ -48,7 +48,7 @@ def test_one_identifier_of_several_exposures():
 
 
 def test_one_detector_cannot_be_in_an_exposure_twice():
-    with pytest.warns(WPDCWarning, match="3 frames of camera C .* have a detector twice"):
+    with pytest.warns(WPDCWarning, match="3 frames of camera C .* include a detector twice"):
         assert exposures([make("A"), make("B"), make("A"), make("A", "8")]) == [None] * 3 + ["8"]
 
 

@@ -65,13 +65,13 @@ def folder(tmp_path):
 @pytest.mark.parametrize(
     ("frame", "catalog", "hint"),
     [
-        ("plane.fits", "gaia.fits", "; try {folder}/plain.fits, which is there"),
-        ("nihgt/a.fits", "gaia.fits", "; try another folder: there is no {folder}/nihgt"),
+        ("plane.fits", "gaia.fits", "; try: {folder}/plain.fits, which is there"),
+        ("nihgt/a.fits", "gaia.fits", "; try: another folder: there is no {folder}/nihgt"),
         ("zzz.fits", "gaia.fits", ""),
-        ("plain.fits", "gaia.fits", "; try --wcs HEADER with the header of another exposure"),
-        ("list.ecsv", "gaia.fits", "; try --wcs HEADER with the header of another exposure"),
-        ("cut.fits", "gaia.fits", "; try get the file again, or leave it out"),
-        ("gaia.fits", "gaia.fits", "; try wpdc show {folder}/gaia.fits tells what it is"),
+        ("plain.fits", "gaia.fits", "; try: --wcs HEADER, with the header of another exposure"),
+        ("list.ecsv", "gaia.fits", "; try: --wcs HEADER, with the header of another exposure"),
+        ("cut.fits", "gaia.fits", "; try: get the file again, or leave it out"),
+        ("gaia.fits", "gaia.fits", "; try: wpdc show {folder}/gaia.fits, which tells what it is"),
     ],
 )
 def test_of_real_errors(folder, capsys, frame, catalog, hint):
@@ -84,9 +84,9 @@ def test_of_real_errors(folder, capsys, frame, catalog, hint):
 
 def test_of_a_catalog_without_positions(folder, capsys):
     assert run(["catalog", "info", str(folder / "no-positions.ecsv")]) == 2
-    assert error_of(capsys).endswith("; try name its columns ra and dec, in degrees")
+    assert error_of(capsys).endswith("; try: rename its columns to ra and dec, in degrees")
     assert run(["catalog", "info", str(folder / "giaa.fits")]) == 2
-    assert error_of(capsys).endswith(f"; try {folder / 'gaia.fits'}, which is there")
+    assert error_of(capsys).endswith(f"; try: {folder / 'gaia.fits'}, which is there")
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_of_a_catalog_without_positions(folder, capsys):
         (DetectionError("no source above 5 sigma on the image"), "wpdc detect 'a b' --threshold 3"),
         (DetectionError("the image is flat: all pixels near 1"), "wpdc show 'a b'"),
         (FitError("a: the frame has shape (ny, nx) 1, the stored solution"), "without --solution"),
-        (FitError("a: 5 stars agree with the solution, at least 10 must"), "more exposures"),
+        (FitError("a: only 5 stars could be fitted; at least 10 are needed"), "more exposures"),
         (FitError("a: centroids 'given' needs a source list"), None),
         (InternalError("internal error: its process died 2 times"), "fewer --jobs"),
         (InternalError("internal error: KeyError: 1"), "please report it"),

@@ -158,7 +158,7 @@ def test_frames_of_other_detectors_are_left_alone(survey, capsys):
     assert "wpdc calibrate --solution ... --update" in captured.err
     write(solution_of("c"), survey / "c.solution.asdf")
     assert run(["monitor", str(survey / "c.solution.asdf"), str(survey)]) == 2
-    assert "is of detector c, the frames are of a, b" in capsys.readouterr().err
+    assert "is for detector c, the frames are from a, b" in capsys.readouterr().err
 
 
 def test_a_survey_on_the_command_line(survey, capsys):
@@ -167,7 +167,7 @@ def test_a_survey_on_the_command_line(survey, capsys):
     more = ["--output", str(out), "--plots", str(survey / "plots")]
     assert run(["monitor", *arguments, *more]) == 1
     told = capsys.readouterr().out.splitlines()
-    assert told[0] == "b: 1 alarms in 2 periods, 4 frames"
+    assert told[0] == "b: 1 alarm in 2 periods, 4 frames"
     assert told[1].startswith("  2020.0833 to 2020.0833: drifted by 0.0")
     assert list(Table.read(out)["drifted"]) == [False, True]
     assert len(Table.read(survey / "out.cells.ecsv")) == 32

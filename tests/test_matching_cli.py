@@ -98,7 +98,7 @@ def test_what_is_given_by_hand(match, tmp_path, capsys):
         (lambda s, c: (s[:1], c), 1, "too few sources to match: 1 "),
         (lambda s, c: (s[:0], c), 1, "has no rows"),
         (lambda s, c: (s, c[:1]), 1, "too few reference stars .* 1 "),
-        (lambda s, c: (s, c[:0]), 2, "catalog must have rows"),
+        (lambda s, c: (s, c[:0]), 2, "catalog must have at least one row"),
         (lambda s, c: (Table({"x": s["x"], "y": s["x"]}), c), 1, "no match with sufficient"),
         (lambda s, c: (Table({"x": s["x"], "y": s["y"] * np.nan}), c), 1, "too few sources"),
         (lambda s, c: (s, Table({"ra": c["ra"], "dec": c["dec"] + 20})), 1, "no star within"),

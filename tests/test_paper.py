@@ -305,7 +305,7 @@ def test_detectors_are_solved_apart_and_fail_alone():
 def test_wrong_options(sky):
     with pytest.raises(ValueError, match="method must be one of wpdc, paper, got 'scamp'"):
         Settings(method="scamp")
-    with pytest.raises(ValueError, match="refine must be auto or pv with method='paper'"):
+    with pytest.raises(ValueError, match="refine must be 'auto' or 'pv' with method='paper'"):
         Settings(method="paper", refine="field")
     with pytest.raises(ValueError, match="update needs method='wpdc'"):
         calibrate([sky.exposures[0].frame()], sky.reference, update=True,

@@ -326,7 +326,7 @@ def test_weights_in_axes_given_and_within_a_radius(rng):
     assert f"exp-sqrt: {d80(dx):.2g} px" in axes.get_legend().get_texts()[0].get_text()
     slices = plotting.plot_slices({"w1": result}, image_shape=(1000, 1000))
     assert len(slices[0].containers) == 1
-    with pytest.raises(ValueError, match="no star is known within 0.001 px"):
+    with pytest.raises(ValueError, match="no star is within 0.001 px"):
         result.within(1e-3)
     with pytest.raises(ValueError, match="component must be one of dx, dy"):
         plotting.plot_weights([result], axes, component="dz")

@@ -180,7 +180,7 @@ def test_resume_says_what_differs(frames, inputs, tmp_path, simulation):
     calibrate(frames, inputs[1], output=tmp_path)
     other = Table.read(inputs[1])[:-1]
     for options, message in (
-        ({"settings": Settings(n_grid=20)}, "n_grid 50, now 20; --overwrite begins anew"),
+        ({"settings": Settings(n_grid=20)}, "n_grid 50, now 20; to begin anew: --overwrite"),
         ({"catalog": other}, "another catalog"),
     ):
         options = {"catalog": inputs[1], **options}

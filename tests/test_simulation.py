@@ -223,7 +223,7 @@ def test_scale_needs_a_unit():
 def test_options_that_no_camera_has():
     with pytest.raises(TypeError, match="simulate has no option pixelscale"):
         simulate(1, pixelscale=0.3 * u.arcsec)
-    with pytest.raises(TypeError, match="a camera of your own has its options already, not fwhm"):
+    with pytest.raises(TypeError, match="a Camera has its options already and takes no fwhm"):
         simulate(1, camera=make_camera(), fwhm=3.0)
     with pytest.raises(TypeError, match="cluster must be a KingCluster or None, not 0.5"):
         simulate(1, cluster=0.5)

@@ -34,14 +34,14 @@ def test_the_story_of_a_run(inputs, tmp_path, capsys):
     expected = [
         "frames: 1 image and 1 source list of 1 detector, 2 exposures; solved in 1 group",
         rf"catalog: \d+ stars with positions, proper motions, .*, of 2016\.0 {seconds}",
-        r"sim-01: sources: \d+ of \d+ sources take part \(.*\); stars have a FWHM of "
-        rf"{number} px; gain of {number} electrons per count, of its header.*",
+        r"sim-01: sources: \d+ of \d+ sources used \(.*\); stars have a FWHM of "
+        rf"{number} px; gain of {number} electrons per count, from the header.*",
         rf"sim-01: match: \d+ pairs, .* expected by chance .*; the header is off by .* {seconds}",
-        r"sim-02: sources: \d+ of \d+ sources take part \(.*\)",
+        r"sim-02: sources: \d+ of \d+ sources used \(.*\)",
         rf"sim-02: match: \d+ pairs, .* {seconds}",
         r"solution: sim: polynomial of degree 3.*, from \d+ pairs in 2 exposures; errors .*",
         rf"solution: 2 frames: 2 solved; \d with a field of their own {seconds}",
-        rf"files: results of 2 of the frames are in {re.escape(str(tmp_path))} {seconds}",
+        rf"files: results of 2 frames written to {re.escape(str(tmp_path))} {seconds}",
     ]
     assert len(lines) == len(expected)
     for line, pattern in zip(lines, expected, strict=True):
@@ -65,7 +65,7 @@ def test_a_frame_that_fails_has_its_line(inputs, tmp_path, capsys):
     ("meta", "words"),
     [
         ({"gain": 1.5, "gain_from": "given"}, "gain of 1.5 electrons per count, as given"),
-        ({"gain": 1.5, "gain_from": "noise"}, "by the noise in its stars"),
+        ({"gain": 1.5, "gain_from": "noise"}, "from the noise in its stars"),
         ({"fwhm": 2.0}, "stars have a FWHM of 2.00 px"),
     ],
 )
@@ -75,7 +75,7 @@ def test_what_is_known_of_sources(inputs, meta, words):
 
     sources = Table({"x": [10.0, 50.0], "y": [20.0, 60.0]}, meta=meta)
     lines = tell_sources(sources, Frame, Settings())
-    assert lines[0].startswith("2 of 2 sources take part")
+    assert lines[0].startswith("2 of 2 sources used")
     assert words in lines[1]
 
 
@@ -126,7 +126,7 @@ def test_the_page_of_a_survey_has_what_is_worth_a_look(tmp_path):
         write_report(summary, {}, Matches.fromkeys(solved), file)
     text = (tmp_path / "page.html").read_text()
     assert "200 more are in <code>summary.ecsv</code>" in text
-    assert text.count("Pooled are 100 of its") == 2
+    assert text.count("Pooled over 100 of its") == 2
     assert text.count('<details id="frame-') == 100
     shown = set(re.findall(r"f\d{3}", text))
     assert {name for name in names if name not in solved} <= shown

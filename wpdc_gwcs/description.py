@@ -4,6 +4,8 @@ from html import escape
 
 import numpy as np
 
+from wpdc_gwcs.counts import counted
+
 __all__ = ["as_html", "describe"]
 
 
@@ -79,7 +81,7 @@ def _of_calibration(calibration):
             (
                 "stars",
                 f"{statistics['n_used']} of {statistics['n_matched']} matched ones used, "
-                f"{statistics['n_sources']} sources",
+                f"{counted(statistics['n_sources'], 'source')}",
             )
         )
     residuals = statistics.get("residuals", {})
@@ -100,7 +102,7 @@ def _of_calibration(calibration):
         text = f"map known to {np.median(sigma):.4f} px, {np.max(sigma):.4f} px at worst"
         lines.append(("certain", text))
     if calibration.field is not None:
-        lines.append(("field", "a smooth field of this exposure (atmosphere)"))
+        lines.append(("field", "a smooth distortion of this exposure alone (atmosphere)"))
     if calibration.color_shift is not None:
         lines.append(("color", f"for stars of color {calibration.reference_color:.2f}"))
     return [*lines, *_of_solution(calibration.solution)]
@@ -114,7 +116,7 @@ def _of_solution(solution):
         x, y = np.meshgrid(np.linspace(0, shape[1] - 1, 21), np.linspace(0, shape[0] - 1, 21))
         u, v = solution.undistort(x.ravel(), y.ravel())
         shift = np.hypot(u - x.ravel(), v - y.ravel())
-        table = "" if solution.lookup_table is None else " and a table of what it leaves"
+        table = "" if solution.lookup_table is None else " and a look-up table of the rest"
         lines.append(
             (
                 "distortion",
@@ -125,13 +127,13 @@ def _of_solution(solution):
     lines.append(("valid", solution.validity))
     inputs = solution.provenance.get("inputs") or ()
     if len(inputs):
-        frames = f"{len(inputs)} frame{'' if len(inputs) == 1 else 's'}"
-        lines.append(("made of", f"{frames}, {solution.provenance.get('created')}"))
+        made = f"{counted(len(inputs), 'frame')}, {solution.provenance.get('created')}"
+        lines.append(("made of", made))
     return lines
 
 
 def _of_camera(camera):
-    lines = [("camera", f"{camera.name}, {len(camera.detectors)} detectors")]
+    lines = [("camera", f"{camera.name}, {counted(len(camera.detectors), 'detector')}")]
     lines.append(("reference", f"{camera.reference}, {_scale(camera.cd)}"))
     for name, solution in camera.solutions.items():
         lines.append((name, dict(_of_solution(solution)).get("distortion", "")))
@@ -141,10 +143,11 @@ def _of_camera(camera):
 def _of_run(run):
     states = [str(status) for status in run.summary["status"]]
     counts = ", ".join(f"{states.count(s)} {s}" for s in dict.fromkeys(states))
-    lines = [("run", f"{run.run_id}: {len(states)} frames, {counts}")]
+    lines = [("run", f"{run.run_id}: {counted(len(states), 'frame')}, {counts}")]
     for row in run.summary:
         sigma = np.hypot(float(row["sigma_dx"].value), float(row["sigma_dy"].value)) / np.sqrt(2)
-        good = f"{row['n_matched']} stars, {sigma:.4f} px, {float(row['rms_mas'].value):.2f} mas"
+        stars = counted(row["n_matched"], "star")
+        good = f"{stars}, {sigma:.4f} px, {float(row['rms_mas'].value):.2f} mas"
         reason = str(row["reason"])
         parts = [str(row["status"]), good if row["n_matched"] else "", reason]
         lines.append((str(row["frame"]), "; ".join(part for part in parts if part)))

@@ -24,6 +24,7 @@ from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs, sky_of
 from wpdc_gwcs.calibration.story import tell_match, tell_sources
 from wpdc_gwcs.catalogs import Region, catalog_source, fill_motions, read_catalog
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 
 __all__ = ["Explanation", "Stage", "explain_frame"]
@@ -169,11 +170,11 @@ def explain_frame(frame, catalog, settings=None):
         reference = reference_in_reach(frame, stars, start, settings)
     except MatchError as error:
         story.advice.append(
-            f"take a catalog of this sky: wpdc catalog prepare gaia --around "
+            f"use a catalog of this part of the sky: wpdc catalog prepare gaia --around "
             f"{shlex.quote(frame.source)} --output gaia.fits"
         )
         story.advice.append("or give another header, if this one points elsewhere (--wcs HEADER)")
-        return story.fail("catalog", error, f"{len(stars)} stars in the catalog or its part")
+        return story.fail("catalog", error, f"{counted(len(stars), 'star')} read from the catalog")
     _tell_catalog(story, stars, reference, start)
     try:
         match = match_frame(frame, stars, settings, sources=sources)
@@ -183,7 +184,9 @@ def explain_frame(frame, catalog, settings=None):
     _tell_match(story, match)
     _, calibrations, failures = solve_camera([match], settings)
     if failures:
-        story.advice.append("solve it with others of its camera, or with a --solution")
+        story.advice.append(
+            "solve it together with other frames of its camera, or with a --solution"
+        )
         return story.fail("solution", next(iter(failures.values())))
     return _tell_solution(story, calibrations[0])
 
@@ -202,7 +205,9 @@ def _tell_frame(story):
         f"{start.scale * 3600:.4g} arcsec / px",
     )
     if frame.epoch is None:
-        story.advice.append("say when it was taken, so that the stars' motions count: --epoch DATE")
+        story.advice.append(
+            "say when it was taken, so that proper motions can be applied: --epoch DATE"
+        )
 
 
 def _tell_sources(story, sources):
@@ -221,7 +226,7 @@ def _tell_sources(story, sources):
         option = next((o for word, o in options.items() if word in worst), "--threshold")
         if rules[worst].any():
             n = int(rules[worst].sum())
-            story.advice.append(f"{n} sources are left out as {worst}: look at {option}")
+            story.advice.append(f"{counted(n, 'source')} left out as {worst}: see {option}")
     return usable
 
 
@@ -232,7 +237,8 @@ def _tell_catalog(story, stars, reference, start):
     inside = int(np.sum((x > 0) & (x < nx) & (y > 0) & (y < ny)))
     story.in_reach = len(reference)
     lines = [
-        f"{len(reference)} of {len(stars)} stars in reach, {inside} on the frame by its header"
+        f"{len(reference)} of {counted(len(stars), 'star')} in reach, {inside} on the frame by "
+        "its header"
     ]
     if "pmra" not in reference.colnames:
         lines.append("it has no proper motions")
@@ -242,7 +248,7 @@ def _tell_catalog(story, stars, reference, start):
         story.advice.append("the catalog is far deeper than the frame: try --max-mag")
     if n > 20 * max(inside, 1):
         story.advice.append(
-            "the frame is far deeper than the catalog: take a deeper one, such as wpdc catalog "
+            "the frame is far deeper than the catalog: use a deeper one, such as wpdc catalog "
             f"prepare gaia --around {shlex.quote(story.frame.source)} --output gaia.fits"
         )
 
@@ -279,10 +285,10 @@ def _advise_on_sources(story, error):
     if story.frame.load_image is None:
         story.advice.append(f"look at the list: wpdc show {name}")
     elif "sigma on the image" in str(error):
-        story.advice.append("if there are stars, though faint ones: --threshold 3")
+        story.advice.append("if there are faint stars: --threshold 3")
         story.advice.append(f"look at the image: wpdc show {name} --output look.png")
     elif "signal-to-noise" in str(error):
-        story.advice.append("take fainter ones: --min-snr 5; if the gain is wrong, --gain")
+        story.advice.append("use fainter ones: --min-snr 5; if the gain is wrong, --gain")
     else:
         story.advice.append(f"look at the image: wpdc show {name} --output look.png")
 
@@ -293,11 +299,13 @@ def _advise_on_match(story, stars, sources, error):
     if error.found is not None:
         _advise_on_header(story, stars, sources, error.found)
     elif story.in_reach < _FEW:
-        story.advice.append(f"{_FEW} reference stars are needed, {story.in_reach} are in reach")
+        story.advice.append(
+            f"{_FEW} reference stars are needed, and the catalog has {story.in_reach} in reach"
+        )
     elif n < _FEW:
         story.advice.append(
-            f"{_FEW} sources are needed, {n} take part: take fainter ones (--threshold 3 --min-snr "
-            "5), or solve it with the other detectors of its camera, or with a --solution"
+            f"{_FEW} sources are needed, {n} can be used: use fainter ones (--threshold 3 "
+            "--min-snr 5), or solve it with the other detectors of its camera, or with a --solution"
         )
     else:
         _try_otherwise(story, stars, sources)
@@ -336,7 +344,7 @@ def _try_otherwise(story, stars, sources, *, last=True):
             continue
         found = match.diagnostics
         story.advice.append(
-            f"it matches with {option} ({found.n_pairs} pairs; the header is off by "
+            f"it matches with {option} ({counted(found.n_pairs, 'pair')}; the header is off by "
             f"{np.hypot(*found.shift):.0f} px and {found.rotation:.1f} deg"
             f"{', mirrored' if found.parity < 0 else ''}): wpdc calibrate {name} {option} ..."
         )

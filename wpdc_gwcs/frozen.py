@@ -23,9 +23,7 @@ class FrozenDict(dict):
     """
 
     def _refuse(self, *_, **__):
-        raise TypeError(
-            "what a result says cannot be changed; dataclasses.replace makes another result"
-        )
+        raise TypeError("results cannot be changed; dataclasses.replace makes another one")
 
     __setitem__ = __delitem__ = __ior__ = _refuse
     clear = pop = popitem = setdefault = update = _refuse
@@ -45,7 +43,7 @@ class _FrozenParameter(Parameter):
     @value.setter
     def value(self, value):
         raise TypeError(
-            f"{self.name} belongs to a result, which cannot be changed; a copy of the model can"
+            f"{self.name} belongs to a result, which cannot be changed; change a copy of the model"
         )
 
     def __deepcopy__(self, memo):

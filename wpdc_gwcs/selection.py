@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from wpdc_gwcs.columns import read_numbers
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.flags import FLAG_NAMES
 
@@ -132,9 +133,11 @@ def left_out(rules):
     total = sum(counts.values())
     of = len(next(iter(rules.values())))
     if total == 0:
-        return f"none of {of} sources left out"
+        return f"none of {counted(of, 'source')} left out"
     parts = sorted(counts.items(), key=lambda item: -item[1])
-    return f"{total} of {of} sources left out: " + ", ".join(f"{n} {name}" for name, n in parts)
+    return f"{total} of {counted(of, 'source')} left out: " + ", ".join(
+        f"{n} {name}" for name, n in parts
+    )
 
 
 def _column(sources, name):

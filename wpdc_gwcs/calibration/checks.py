@@ -7,6 +7,7 @@ degraded, with the reasons.
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.evaluation import binned_residuals
 from wpdc_gwcs.exceptions import FitError
@@ -81,8 +82,8 @@ def check_solution(frame, calibration, *, stored=None, known=False):
     least = _MIN_STARS_KNOWN if known else _MIN_STARS
     if statistics["n_used"] < least:
         raise FitError(
-            f"{frame.source}: {statistics['n_used']} stars agree with the solution, at least "
-            f"{least} must"
+            f"{frame.source}: only {counted(statistics['n_used'], 'star')} could be fitted; at "
+            f"least {least} are needed"
         )
     used = np.asarray(calibration.matches["used"])
     sigma = max(residuals["sigma_dx"], residuals["sigma_dy"])
@@ -90,14 +91,14 @@ def check_solution(frame, calibration, *, stored=None, known=False):
     typical = float(np.median(errors))
     if sigma > max(_MAX_SIGMA, _MAX_OVER_ERRORS * typical):
         raise FitError(
-            f"{frame.source}: the residuals scatter by {sigma:.2f} px, at most {_MAX_SIGMA} px, or "
-            f"{_MAX_OVER_ERRORS:g} times their errors of {typical:.2f} px, are accepted"
+            f"{frame.source}: the residuals scatter by {sigma:.2f} px; at most {_MAX_SIGMA} px, or "
+            f"{_MAX_OVER_ERRORS:g} times their errors of {typical:.2f} px, is accepted"
         )
     expected = None if stored is None else stored.statistics.get("sigma_px")
     if expected is not None and sigma > max(_STORED_RATIO * expected, _MAX_OFFSET):
         raise FitError(
             f"{frame.source}: the residuals scatter by {sigma:.2f} px, those of the stored "
-            f"solution by {expected:.2f} px: it is not that of this detector, or no longer"
+            f"solution by {expected:.2f} px: it is not for this detector, or no longer holds"
         )
 
 
@@ -133,11 +134,13 @@ def shortcomings(frame, calibration, *, held, known=False, stored=None):
         pass  # other frames have stars where this one has none
     elif share < _MIN_COVERAGE:
         reasons.append(
-            f"its {used.sum()} stars span {share:.0%} of the detector (x {x.min():.0f} to "
-            f"{x.max():.0f} of {nx} px, y {y.min():.0f} to {y.max():.0f} of {ny})"
+            f"its {counted(used.sum(), 'star')} cover {share:.0%} of the detector (x "
+            f"{x.min():.0f} to {x.max():.0f} of {nx} px, y {y.min():.0f} to {y.max():.0f} of {ny})"
         )
     elif hole > _MAX_HOLE:
-        reasons.append(f"a circle of {hole:.0%} of the detector has none of its {used.sum()} stars")
+        reasons.append(
+            f"a circle of {hole:.0%} of the detector is empty of its {counted(used.sum(), 'star')}"
+        )
     sigma = np.max(np.asarray(calibration.sigma)[:2], axis=0)
     uncertain = float(np.mean(~(sigma <= _MAX_MAP_SIGMA)))
     if uncertain > _UNCERTAIN_SHARE:
@@ -147,15 +150,15 @@ def shortcomings(frame, calibration, *, held, known=False, stored=None):
         )
     n = int(np.sum(~held))
     if used.sum() < _MIN_USED * n:
-        reasons.append(f"{used.sum()} of {n} matched stars agree with the solution")
+        reasons.append(f"only {used.sum()} of {n} matched stars agree with the solution")
     if stored is not None and not stored.holds_at(frame.epoch):
         reasons.append(
-            f"the stored solution is valid {stored.validity}, the frame is of {frame.epoch:.4f}"
+            f"the stored solution is valid {stored.validity}; the frame is from {frame.epoch:.4f}"
         )
     match = frame.diagnostics
     if match.completeness < _MIN_COMPLETENESS:
         reasons.append(
-            f"{match.n_pairs} of {match.n_sources} clean detections and {match.n_reference} "
+            f"only {match.n_pairs} of {match.n_sources} clean detections and {match.n_reference} "
             "reference stars on the frame match"
         )
     else:
@@ -164,7 +167,7 @@ def shortcomings(frame, calibration, *, held, known=False, stored=None):
         reasons.append("the frame has no epoch: the stars' motions could not be applied (--epoch)")
     low, high = calibration.solution.area_range
     if not (low >= _MIN_AREA and high <= _MAX_AREA):
-        reasons.append(f"the map stretches the detector by {low:.2f} to {high:.2f} in area")
+        reasons.append(f"the map changes the area of pixels by factors of {low:.2f} to {high:.2f}")
     offset = _offset_of_parts(matches, used, frame.image_shape, calibration.statistics)
     if offset is not None:
         reasons.append(offset)
@@ -177,9 +180,9 @@ def _few_detections(frame, match):
     detected = int(on_detector(sources["x"], sources["y"], frame.image_shape).sum())
     if match.n_pairs < _MIN_DETECTED * min(detected, match.n_reference):
         return [
-            f"{match.n_pairs} of {detected} detections match, {detected - match.n_sources} are "
-            f"left out (flagged, not round or faint); the catalog has {match.n_reference} stars "
-            "on the frame"
+            f"only {match.n_pairs} of {detected} detections match: {detected - match.n_sources} "
+            "are left out (flagged, not round or faint); the catalog has "
+            f"{counted(match.n_reference, 'star')} on the frame"
         ]
     # A shallow catalog has the bright stars: of the faint ones nobody knows.
     clean = np.flatnonzero(frame.usable)
@@ -191,8 +194,8 @@ def _few_detections(frame, match):
     if matched >= _MIN_COMPLETENESS * len(bright):
         return []
     return [
-        f"{matched} of the {len(bright)} brightest of {match.n_sources} clean detections match; "
-        "the catalog has as many stars on the frame"
+        f"only {matched} of the {len(bright)} brightest of {match.n_sources} clean detections "
+        "match; the catalog has as many stars on the frame"
     ]
 
 

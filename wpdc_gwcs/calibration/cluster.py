@@ -151,8 +151,7 @@ class _WatchedExecutor(Executor):
             if waited > _BUSY and not said:
                 said = True
                 log.warning(
-                    "%s: no worker of the Dask scheduler is to be seen for %.0f s; waiting at most "
-                    "%g s",
+                    "%s: the Dask scheduler has had no worker for %.0f s; waiting at most %g s",
                     self._address,
                     waited,
                     self._timeout,

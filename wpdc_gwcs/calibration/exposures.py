@@ -57,7 +57,7 @@ def tie_exposures(frames):
         for part in [p for same in _by_start(frames, rows) for p in _by_place(frames, same)]:
             split = _without_doubles(frames, part)
             if split is None:
-                _warn(frames, part, "have a detector twice; each is taken on its own")
+                _warn(frames, part, "include a detector twice; each frame is taken on its own")
                 tied = [replace(f, exposure=None) if i in part else f for i, f in enumerate(tied)]
             else:
                 parts += split
@@ -92,7 +92,9 @@ def _by_place(frames, rows):
         parts.append([rows[i] for i in near])
         left -= set(near)
     if len(parts) > 1:
-        _warn(frames, rows, "point to different parts of the sky; they are taken as several")
+        _warn(
+            frames, rows, "point to different parts of the sky; they are taken as several exposures"
+        )
     return parts
 
 

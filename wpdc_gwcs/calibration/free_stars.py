@@ -99,13 +99,13 @@ def solve_free_stars(exposures, result, solve):
         scales = _scales(pairs)
         if scales is None:
             log.warning(
-                "free stars: fewer than %d stars with errors are in two exposures or more: all "
-                "stay where the catalog has them", _LEAST_STARS,
+                "free stars: fewer than %d stars with errors are in two or more exposures: all "
+                "stay at their catalog positions", _LEAST_STARS,
             )  # fmt: skip
             return first
         moved = _moved(exposures, pairs, scales)
         result = solve(moved)
-    log.info("free stars: errors of centroids x %.2f, of the catalog x %.2f", *scales)
+    log.info("free stars: centroid errors scaled by %.2f, catalog errors by %.2f", *scales)
     return _about_catalog(exposures, moved, first, result, scales)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.centroids import fit_centroids, measure_noise, measure_psf, residual_of
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.detection import (
     detect_companions,
     detect_sources,
@@ -88,12 +89,12 @@ def measure_sources(frame, settings=None):
         return sources
     if settings.centroids == "given":
         raise DetectionError(
-            f"{frame.source}: centroids 'given' needs a source list, and this is an image"
+            f"{frame.source}: centroids='given' needs a source list, and this is an image"
         )
     if min(frame.image_shape) < _SMALLEST:
         raise DetectionError(
-            f"{frame.source}: the image must be at least {_SMALLEST} x {_SMALLEST} px, is of shape "
-            f"(ny, nx) {frame.image_shape}"
+            f"{frame.source}: the image must be at least {_SMALLEST} x {_SMALLEST} px, has the "
+            f"shape (ny, nx) {frame.image_shape}"
         )
     announce("background")
     mask = None if frame.load_mask is None else frame.load_mask()
@@ -121,7 +122,7 @@ def measure_sources(frame, settings=None):
                 origin = "noise"
                 measured = _measure_gain(background, detected, noise)
                 if wrong:
-                    why = f"the noise in its stars is that of a gain of {measured:.3g}"
+                    why = f"the noise in its stars implies a gain of {measured:.3g}"
                     _warn(frame, "gain", gain, why)
                 gain = measured if measured > 0 else None
                 detected = detect_sources(background, gain=gain, **options)
@@ -140,8 +141,8 @@ def measure_sources(frame, settings=None):
     bright = (_APERTURE_SHARE if "chi2" in sources.colnames else 1.0) * snr >= settings.min_snr
     if not bright.any():
         raise DetectionError(
-            f"{frame.source}: none of {len(sources)} sources has a signal-to-noise ratio above "
-            f"{settings.min_snr:g}"
+            f"{frame.source}: none of {counted(len(sources), 'source')} has a signal-to-noise "
+            f"ratio above {settings.min_snr:g}"
         )
     sources.meta["n_faint"] = int(np.count_nonzero(~bright))
     return sources[bright]
@@ -255,8 +256,8 @@ def _saturation(frame, settings, background):
 
 def _warn(frame, what, value, why):
     warnings.warn(
-        f"{frame.source}: the header's {what} of {value:g} is not that of the pixels, and is left "
-        f"aside: {why}",
+        f"{frame.source}: the header's {what} of {value:g} disagrees with the pixels and is "
+        f"ignored: {why}",
         WPDCWarning,
     )
 

@@ -69,7 +69,8 @@ def names_of(group, cameras):
         names[f"{file_stem(detector)}.solution.asdf"] = f"detector {detector!r}"
     if len(names) < len(FRAME_SUFFIXES) * len(group) + len(detectors):
         raise InputError(
-            f"detectors must have different names in files, got {', '.join(sorted(detectors))}"
+            "the names of detectors must differ in file names too, got "
+            f"{', '.join(sorted(detectors))}"
         )
     if len(detectors) > 1:
         camera = next((frame.camera for frame in group if frame.camera), "camera")

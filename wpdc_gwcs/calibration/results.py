@@ -235,8 +235,8 @@ class ResultFolder:
             return
         if found:
             raise InputError(
-                f"{self.folder}: a run is resumed with the same choices: {'; '.join(found)}; "
-                "--overwrite begins anew"
+                f"{self.folder}: a run must be resumed with the same choices: {'; '.join(found)}; "
+                "to begin anew: --overwrite"
             )
         rows = _read_rows(self.folder / SUMMARY, earlier.run)
         states = {}

@@ -37,6 +37,7 @@ from wpdc_gwcs.catalogs import (
     read_catalog,
     split_extension,
 )
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import (
     CatalogError,
     ClusterError,
@@ -194,13 +195,11 @@ def calibrate(
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {jobs}")
     if resume and output is None:
-        raise ValueError("resume needs the output folder of the run that is resumed")
+        raise ValueError("resume needs output, the folder of the run to resume")
     if not keep and output is None:
-        raise ValueError("keep=False needs an output folder, which has the calibrations")
+        raise ValueError("keep=False needs output, a folder for the calibrations")
     if update and settings.method == "paper":
-        raise ValueError(
-            "update needs method='wpdc': the paper's table is made anew, from frames of its time"
-        )
+        raise ValueError("update needs method='wpdc': the paper's table is always made anew")
     progress = progress or (lambda stage, done, total: None)
     solution = getattr(solution, "solutions", solution)
     frames = _named_apart(tie_exposures(frames)) if solution is None else tie_exposures(frames)
@@ -252,8 +251,8 @@ def calibrate(
                     began = time.perf_counter()
                     folder.write(group, outcome)
                     log.info(
-                        "files: results of %d of the frames are in %s (%.1f s)",
-                        len(group), output, time.perf_counter() - began,
+                        "files: results of %s written to %s (%.1f s)",
+                        counted(len(group), "frame"), output, time.perf_counter() - began,
                     )  # fmt: skip
     resumed = tuple(frame.name for group in done for frame in group)
     return _joined(frames, list(outcomes.values()), run_id, resumed)
@@ -429,8 +428,8 @@ def _of_other_detectors(frames, solution):
     return {
         f.name: FailedFrame(
             FitError(
-                f"{f.source}: the frame is of detector {f.detector!r}, the stored solutions are of "
-                f"{named or 'none'}"
+                f"{f.source}: the frame is from detector {f.detector!r}, the stored solutions are "
+                f"for {named or 'none'}"
             ),
             0,
             0.0,

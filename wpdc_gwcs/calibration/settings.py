@@ -108,11 +108,11 @@ class Settings:
                 )
         if self.method == "paper" and self.refine not in ("auto", "pv"):
             raise ValueError(
-                "refine must be auto or pv with method='paper', where every exposure has a "
-                f"polynomial of its own, got {self.refine!r}"
+                "refine must be 'auto' or 'pv' with method='paper', where every exposure has "
+                f"its own polynomial, got {self.refine!r}"
             )
         if self.method == "paper" and self.free_stars:
-            raise ValueError("free_stars must be False with method='paper', which has no such step")
+            raise ValueError("free_stars must be False with method='paper', got True")
         if self.degree != "auto" and self.degree not in range(1, 8):
             raise ValueError(f"degree must be 'auto' or 1 to 7, got {self.degree!r}")
         if not 4 <= self.n_grid <= 1000:

@@ -69,7 +69,7 @@ def lock(folder):
     except BlockingIOError:
         os.close(descriptor)
         raise InputError(
-            f"{folder}: another run is writing into this folder: wait, or choose another one"
+            f"{folder}: another run is writing to this folder: wait, or choose another folder"
         ) from None
     except OSError:
         os.close(descriptor)

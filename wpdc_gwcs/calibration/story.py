@@ -7,6 +7,7 @@ import numpy as np
 
 from wpdc_gwcs.calibration.matched import FailedFrame
 from wpdc_gwcs.calibration.measure import rules_of
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.selection import left_out
 
 __all__ = [
@@ -24,8 +25,8 @@ log = logging.getLogger(__name__)
 
 _GAIN = {
     "given": "as given",
-    "header": "of its header, which its noise bears out",
-    "noise": "by the noise in its stars",
+    "header": "from the header, confirmed by the noise",
+    "noise": "from the noise in its stars",
 }
 # What a catalog may have besides positions, and how it is called.
 _COLUMNS = {
@@ -69,12 +70,12 @@ def tell_frames(frames, groups):
     """
     images = sum(frame.load_image is not None for frame in frames)
     kinds = Counter({"image": images, "source list": len(frames) - images})
-    kinds = " and ".join(_many(n, what) for what, n in kinds.items() if n)
+    kinds = " and ".join(counted(n, what) for what, n in kinds.items() if n)
     exposures = {(f.camera, f.exposure or f.name) for f in frames}
     detectors = {(f.camera, f.detector) for f in frames}
     return [
-        f"frames: {kinds} of {_many(len(detectors), 'detector')}, "
-        f"{_many(len(exposures), 'exposure')}; solved in {_many(len(groups), 'group')}"
+        f"frames: {kinds} of {counted(len(detectors), 'detector')}, "
+        f"{counted(len(exposures), 'exposure')}; solved in {counted(len(groups), 'group')}"
     ]
 
 
@@ -94,7 +95,7 @@ def tell_catalog(catalog, seconds):
         A line.
     """
     have = [word for name, word in _COLUMNS.items() if name in catalog.colnames]
-    text = f"catalog: {_many(len(catalog), 'star')} with {', '.join(['positions', *have])}"
+    text = f"catalog: {counted(len(catalog), 'star')} with {', '.join(['positions', *have])}"
     if "ref_epoch" in catalog.colnames and len(catalog):
         text += f", of {float(np.nanmedian(np.asarray(catalog['ref_epoch'], float))):.1f}"
     return [f"{text} ({seconds:.1f} s)"]
@@ -119,7 +120,7 @@ def tell_sources(sources, frame, settings):
     """
     rules = rules_of(sources, frame, settings)
     usable = int(np.sum(~np.any(list(rules.values()), axis=0)))
-    lines = [f"{usable} of {len(sources)} sources take part ({left_out(rules)})"]
+    lines = [f"{usable} of {counted(len(sources), 'source')} used ({left_out(rules)})"]
     fwhm = sources.meta.get("fwhm")
     if fwhm is not None and np.isfinite(float(getattr(fwhm, "value", fwhm))):
         lines.append(f"stars have a FWHM of {float(getattr(fwhm, 'value', fwhm)):.2f} px")
@@ -143,12 +144,12 @@ def tell_match(found):
         Pairs and evidence, what the header was off by, what was left out.
     """
     return [
-        f"{found.n_pairs} pairs, {found.expected_by_chance:.1f} expected by chance "
+        f"{counted(found.n_pairs, 'pair')}, {found.expected_by_chance:.1f} expected by chance "
         f"({found.significance:.0f} sigma), purity {found.purity:.3f}",
         f"the header is off by {found.shift[0]:.1f}, {found.shift[1]:.1f} px, turned by "
         f"{found.rotation:.3f} deg, scaled by {found.scale:.5f}"
         + (", mirrored" if found.parity < 0 else ""),
-        f"{found.n_ambiguous} sources with two candidates left out, pairs scatter by "
+        f"{counted(found.n_ambiguous, 'source')} with two candidates left out, pairs scatter by "
         f"{found.scatter:.2f} px about a smooth mapping",
     ]
 
@@ -208,8 +209,8 @@ def tell_solution(solution):
         text += f" ({table['kernel']} of {table['freedom']:.0f} degrees of freedom)"
     if "n_used" in statistics:
         text += (
-            f", from {_many(statistics['n_used'], 'pair')} in "
-            f"{_many(statistics['n_exposures'], 'exposure')}"
+            f", from {counted(statistics['n_used'], 'pair')} in "
+            f"{counted(statistics['n_exposures'], 'exposure')}"
         )
     if "error_scale" in statistics:
         text += f"; errors of the stars x {statistics['error_scale']:.2f}"
@@ -236,10 +237,6 @@ def tell_outcome(outcome, seconds):
     told = ", ".join(f"{states[s]} {s}" for s in ("solved", "degraded", "failed") if states[s])
     return [
         *(f"solution: {tell_solution(one)}" for one in outcome.solutions.values()),
-        f"solution: {_many(len(outcome.rows), 'frame')}: {told}; {fields} with a field of their "
+        f"solution: {counted(len(outcome.rows), 'frame')}: {told}; {fields} with a field of their "
         f"own ({seconds:.1f} s)",
     ]
-
-
-def _many(n, what):
-    return f"{n} {what}{'s' * (n != 1)}"

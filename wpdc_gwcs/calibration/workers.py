@@ -155,12 +155,13 @@ def _stored_for(solution, frame):
     if solution is not None and tuple(solution.image_shape) != tuple(frame.image_shape):
         raise FitError(
             f"{frame.source}: the frame has shape (ny, nx) {tuple(frame.image_shape)}, the stored "
-            f"solution is for {tuple(solution.image_shape)}"
+            f"solution has {tuple(solution.image_shape)}"
         )
     if solution is not None and frame.detector != solution.detector:
         raise FitError(
-            f"{frame.source}: the frame is of detector {frame.detector!r}, the stored solution of "
-            f"{solution.detector!r}; if they are one, name it (--detector {solution.detector})"
+            f"{frame.source}: the frame is from detector {frame.detector!r}, the stored solution "
+            f"for {solution.detector!r}; if these are the same, say so (--detector "
+            f"{solution.detector})"
         )
     return solution
 

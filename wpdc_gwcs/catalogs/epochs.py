@@ -61,7 +61,7 @@ def reference_epochs(table, spelled, position, name, *, has_motion):
     if epochs is None and has_motion:
         warnings.warn(
             f"{name}: proper motions without a reference epoch: {_ASSUMED_EPOCH} (Gaia DR3) is "
-            "assumed; a column 'ref_epoch' would say",
+            "assumed; a column 'ref_epoch' would tell",
             WPDCWarning,
         )
         epochs = np.full(len(table), _ASSUMED_EPOCH)

@@ -235,7 +235,7 @@ def read_table_file(path, format=None):
         return Table.read(lines, format="ascii", fill_values=_FILL)
     except InconsistentTableError as problem:
         # astropy lists all that it has tried, in fifty lines
-        raise ValueError("it has no form of a table that is known") from problem
+        raise ValueError("it is not a table in any known format") from problem
 
 
 def read_lines(path):
@@ -314,7 +314,7 @@ def decode(content):
     """
     encoding = next((e for mark, e in _MARKS if content.startswith(mark)), "utf-8")
     if encoding.startswith("utf-8") and _BINARY.search(content):
-        raise ValueError("it is neither text nor a table of a known kind")
+        raise ValueError("it is neither text nor a table of a known format")
     try:
         return content.decode(encoding)
     except UnicodeDecodeError:

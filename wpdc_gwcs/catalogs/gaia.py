@@ -84,10 +84,14 @@ class GaiaArchive:
     def __post_init__(self):
         url = self.url or os.environ.get("WPDC_GWCS_TAP_URL") or _ESA
         if not re.match(r"https?://[^/\s]+", url):
-            raise CatalogError(f"address of a TAP service must begin with http(s)://, got {url!r}")
+            raise CatalogError(
+                f"the address of a TAP service must begin with http:// or https://, got {url!r}"
+            )
         object.__setattr__(self, "url", url.rstrip("/"))
         if not re.fullmatch(r"[\w.\"]+", self.table):
-            raise CatalogError(f"table of a TAP service must be a name, got {self.table!r}")
+            raise CatalogError(
+                f"the table of a TAP service must be a plain name, got {self.table!r}"
+            )
         if not np.isfinite(self.max_mag):
             raise CatalogError(f"max_mag must be a finite magnitude, got {self.max_mag}")
 
@@ -164,7 +168,7 @@ class GaiaArchive:
             try:
                 table = Table.read(kept[limit], format="fits", mask_invalid=False)
             except READ_ERRORS as problem:
-                log.info("%s: cannot be read, and is asked for again: %s", kept[limit], problem)
+                log.info("%s: cannot be read and is requested again: %s", kept[limit], problem)
                 continue
             if set(_COLUMNS) <= set(table.colnames):
                 return table[np.asarray(table["phot_g_mean_mag"]) <= self.max_mag]
@@ -183,7 +187,7 @@ class GaiaArchive:
         problem = None
         for wait in _WAITS:
             if problem is not None:
-                log.info("%s: %s: another try in %g s", self.url, problem, wait)
+                log.info("%s: %s: trying again in %g s", self.url, problem, wait)
                 time.sleep(wait)
             try:
                 table = _answer(self.url, query)
@@ -192,20 +196,22 @@ class GaiaArchive:
                 raise CatalogError(f"{self.url} refuses the query: {_line(refusal)}") from refusal
             except pyvo.dal.DALOverflowWarning as overflow:
                 raise CatalogError(
-                    f"{self.url} does not give all stars of a cell of 0.8 square degrees: ask for "
-                    f"fewer (--max-mag, now {self.max_mag:g}), or another service (--tap-url)"
+                    f"{self.url} does not return all stars of a cell of 0.8 square degrees: ask "
+                    f"for fewer (--max-mag, now {self.max_mag:g}), or another service (--tap-url)"
                 ) from overflow
             except (pyvo.dal.DALAccessError, requests.RequestException, *READ_ERRORS) as error:
                 problem = _line(error)
         else:
             raise CatalogError(
-                f"{self.url} does not answer, in {len(_WAITS)} tries: {problem}; name another "
-                "service (--tap-url), or make a file where there is a network ('wpdc catalog "
+                f"{self.url} did not answer in {len(_WAITS)} tries: {problem}; name another "
+                "service (--tap-url), or make a file on a machine with a network ('wpdc catalog "
                 "prepare gaia') and give it as --catalog"
             )
         lacking = set(_COLUMNS) - set(table.colnames)
         if lacking:
-            raise CatalogError(f"{self.url} does not give the columns {', '.join(sorted(lacking))}")
+            raise CatalogError(
+                f"{self.url} does not return the columns {', '.join(sorted(lacking))}"
+            )
         table = Table(table)[list(_COLUMNS)]
         ra, dec = (np.asarray(table[name], float) for name in ("ra", "dec"))
         return table[cells_of(_ORDER, ra, dec) == cell]
@@ -254,7 +260,7 @@ def _keep(table, path):
             os.unlink(temporary)
             raise
     except OSError as problem:
-        log.warning("what came from the archive cannot be kept: %s", problem)
+        log.warning("the answer of the archive cannot be cached: %s", problem)
 
 
 def _line(error):

@@ -41,7 +41,9 @@ class HatsCatalog:
     def __post_init__(self):
         folder = Path(self.path)
         if not folder.is_dir():
-            raise CatalogError(f"hats:{self.path}: must be the folder of a catalog, is none")
+            raise CatalogError(
+                f"hats:{self.path}: must be the folder of a catalog, is not a folder"
+            )
         if not any((folder / name).is_file() for name in (*_ABOUT, "collection.properties")):
             raise CatalogError(
                 f"hats:{self.path}: must be the folder of a catalog, with a file {_ABOUT[0]!r}"

@@ -9,6 +9,7 @@ from astropy import units as u
 from astropy.coordinates import Angle, SkyCoord
 
 from wpdc_gwcs.columns import convert, read_numbers, read_text, spelled_names, unit_of
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
 
 __all__ = ["POSITION_NAMES", "find_positions", "plain_degrees", "read_positions", "turn_to_icrs"]
@@ -114,7 +115,7 @@ def read_positions(table, pair, name):
     if not finite.any():
         raise CatalogError(
             f"{name}: catalog must have rows with finite {pair[0]!r} and {pair[1]!r}, "
-            f"none of {len(table)} has"
+            f"none of {counted(len(table), 'row')} has"
         )
     keep = finite.copy()
     dropped = []
@@ -138,12 +139,12 @@ def read_positions(table, pair, name):
         log.info("%s: %d of %d rows have no position", name, missing, len(table))
     if dropped:
         warnings.warn(
-            f"{name}: {np.sum(~keep) - missing} of {len(table)} rows are left out: "
+            f"{name}: {np.sum(~keep) - missing} of {counted(len(table), 'row')} left out: "
             + "; ".join(dropped),
             WPDCWarning,
         )
     if not keep.any():
-        raise CatalogError(f"{name}: none of {len(table)} rows has a position that can be used")
+        raise CatalogError(f"{name}: none of {counted(len(table), 'row')} has a usable position")
     rounding = 0.0
     if any(getattr(table[column], "dtype", None) == np.float32 for column in pair):
         # half a step of the last bit at most, a uniform distribution
@@ -239,15 +240,15 @@ def _radians_to_degrees(table, pair, values, name):
     density = len(ra) / side**2
     if density > (_DENSE if named else _TOO_DENSE):
         warnings.warn(
-            f"{name}: columns {pair[0]!r} and {pair[1]!r} have no unit and are taken for radians: "
-            f"as degrees, they would have {density:.2g} stars per square degree",
+            f"{name}: columns {pair[0]!r} and {pair[1]!r} have no unit and are taken to be "
+            f"radians: in degrees, they would have {density:.2g} stars per square degree",
             WPDCWarning,
         )
         return 180.0 / np.pi
     if named:
         raise CatalogError(
-            f"{name}: columns {pair[0]!r} and {pair[1]!r} must have a unit: without, they may be "
-            f"degrees or radians ({ra[0]:g}, {dec[0]:g} in the first row)"
+            f"{name}: columns {pair[0]!r} and {pair[1]!r} must have a unit: without one, they may "
+            f"be degrees or radians ({ra[0]:g}, {dec[0]:g} in the first row)"
         )
     return 1.0
 

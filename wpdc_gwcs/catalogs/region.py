@@ -47,7 +47,7 @@ class Region:
             values = np.array(getattr(self, name), float, ndmin=1)
             object.__setattr__(self, name, values)
         if not len(self.ra) == len(self.dec) == len(self.radius) > 0:
-            raise ValueError("a region needs as many centers as radii, and at least one")
+            raise ValueError("a region needs at least one cone, and as many centers as radii")
         wrong = ~(np.isfinite(self.ra) & (np.abs(self.dec) <= 90) & (self.radius >= 0))
         wrong |= ~np.isfinite(self.radius)
         if wrong.any():
@@ -81,7 +81,7 @@ class Region:
         """
         if not (np.isfinite([west, east]).all() and -90 <= south < north <= 90):
             raise ValueError(
-                "a box needs right ascensions and declinations from south to north in [-90, 90] "
+                "a box needs right ascensions, and declinations from south to north in [-90, 90] "
                 f"deg, got {west:g}, {east:g}, {south:g}, {north:g}"
             )
         width = (east - west) % 360.0 or 360.0

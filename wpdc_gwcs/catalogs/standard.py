@@ -157,7 +157,7 @@ def read_catalog(source, *, format=None, region=None):
             if part.n_wrong:
                 warnings.warn(
                     f"{name}: {part.n_wrong} of {part.n_rows} rows are left out: their positions "
-                    "are off the sky",
+                    "are not on the sky",
                     WPDCWarning,
                 )
             return _standardize_part(part.table, name, part.rows, _file_identity(source))
@@ -166,7 +166,9 @@ def read_catalog(source, *, format=None, region=None):
     elif hasattr(source, "stars_of"):
         name = str(source)
         if region is None:
-            raise CatalogError(f"{name}: needs a region of the sky, got none: it is too large")
+            raise CatalogError(
+                f"{name}: needs a region of the sky, got none: it is too large to be read whole"
+            )
         table = source.stars_of(region)
         return _standardize_part(table, name, np.arange(len(table)), source.identity)
     else:
@@ -284,7 +286,7 @@ def _table_of_coordinates(coordinates):
 def _standardize(table, name, rows=None):
     """Build the checked table; `name` is what messages call the input, `rows` where they were."""
     if len(table) == 0:
-        raise CatalogError(f"{name}: catalog must have rows, has 0")
+        raise CatalogError(f"{name}: catalog must have at least one row, has 0")
     spelled = spelled_names(table.colnames)
     pair = find_positions(spelled)
     if pair is None:
@@ -367,10 +369,10 @@ def _optional(table, column, unit, name):
     if unreadable.any():
         row = int(np.flatnonzero(unreadable)[0])
         log.info(
-            "%s: %d values of column %r cannot be read, such as %r",
+            "%s: unreadable values in column %r: %d, such as %r",
             name,
-            unreadable.sum(),
             column,
+            unreadable.sum(),
             str(table[column][row]),
         )
     return values

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 
 from wpdc_gwcs.copies import group_copies
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import WPDCWarning
 from wpdc_gwcs.sky import directions, move
 
@@ -68,9 +69,9 @@ def one_of_each(columns, keep, identifiers, name):
     if not best.all():
         again = np.flatnonzero(~best)
         warnings.warn(
-            f"{name}: {len(again)} of {n} rows are further rows of a star that is there already "
-            f"(RA {part['ra'][again[0]]:.6f} Dec {part['dec'][again[0]]:.6f} deg for one): one row "
-            "of each star is kept",
+            f"{name}: {len(again)} of {counted(n, 'row')} repeat a star that another row has (for "
+            f"example at RA {part['ra'][again[0]]:.6f} Dec {part['dec'][again[0]]:.6f} deg): one "
+            "row per star is kept",
             WPDCWarning,
         )
     return best

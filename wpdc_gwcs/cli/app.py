@@ -98,7 +98,7 @@ def set_verbosity(verbose, quiet):
 def _fail(message, status):
     text = " ".join(str(message).split())
     hint = hint_of(text)
-    print(f"wpdc: error: {text}" + (f"; try {hint}" if hint else ""), file=sys.stderr)
+    print(f"wpdc: error: {text}" + (f"; try: {hint}" if hint else ""), file=sys.stderr)
     return status
 
 

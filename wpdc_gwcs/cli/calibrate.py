@@ -42,6 +42,7 @@ from wpdc_gwcs.cli.options import (
 )
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.cli.report import write_page
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError, InternalError
 
 log = logging.getLogger("wpdc_gwcs.cli")
@@ -261,15 +262,18 @@ def calibrate_command(
     if update and not solution:
         raise InputError("--update needs the stored solution: --solution FILE")
     if update and method == "paper":
-        raise InputError(
-            "--update needs --method wpdc: the paper's table is made anew, from frames of its time"
-        )
+        raise InputError("--update needs --method wpdc: the paper's table is always made anew")
     if no_camera and exposure_key is not None:
-        raise InputError("--exposure-key ties detectors together, --no-camera keeps them apart")
+        raise InputError(
+            "--exposure-key and --no-camera exclude each other: one ties detectors, the other "
+            "does not"
+        )
     if detector is not None and not (detector.strip() and detector.isprintable()):
-        raise InputError(f"--detector must be a name that can be printed, got {detector!r}")
+        raise InputError(f"--detector must be a printable name, got {detector!r}")
     if not 0 < scheduler_timeout < float("inf"):
-        raise InputError(f"--scheduler-timeout must be positive seconds, got {scheduler_timeout}")
+        raise InputError(
+            f"--scheduler-timeout must be positive, in seconds, got {scheduler_timeout}"
+        )
     if jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {jobs}")
     settings = settings_of(
@@ -325,8 +329,8 @@ def calibrate_command(
     if not quiet:
         if resume:
             typer.echo(
-                f"{len(run.resumed)} of {len(run.summary)} frames are left out: done already by "
-                f"run {run.run_id}"
+                f"{len(run.resumed)} of {counted(len(run.summary), 'frame')} skipped: run "
+                f"{run.run_id} has done them already"
             )
         print_summary(run, output)
         if update:
@@ -341,8 +345,8 @@ def calibrate_command(
     for what, found in (("degraded", degraded), ("not solved", run.failures)):
         if len(found) > _MOST_LINES:
             log.warning(
-                "%d more frames are %s: see the column 'reason' of %s",
-                len(found) - _MOST_LINES, what, output / "summary.ecsv",
+                "%s %s: see the column 'reason' of %s",
+                counted(len(found) - _MOST_LINES, "more frame"), what, output / "summary.ecsv",
             )  # fmt: skip
     if not quiet:
         tell_hints(run.failures, {f.name: f.source for f in loaded}, catalog=catalog, wcs=wcs)
@@ -382,7 +386,7 @@ def stored_solutions(paths):
         for name, one in several.items():
             if name in found:
                 raise InputError(
-                    f"{path}: detector {name!r} has a solution in {source[name]} already"
+                    f"{path}: detector {name!r} already has a solution, in {source[name]}"
                 )
             found[name], source[name] = one, path
     if not found:
@@ -424,7 +428,7 @@ def print_changes(run):
         if not solution.statistics.get("updates"):
             continue
         last = solution.statistics["updates"][-1]
-        exposures = f"{last['n_exposures']} exposures"
+        exposures = counted(last["n_exposures"], "exposure")
         if last["process_noise"] == 0:
             typer.echo(f"{name}: no change found, {exposures} added")
             continue
@@ -469,4 +473,6 @@ def print_summary(run, folder):
     n = int(np.sum(run.summary["status"] != "failed"))
     degraded = int(np.sum(run.summary["status"] == "degraded"))
     also = f", {degraded} of them degraded" if degraded else ""
-    typer.echo(f"{n} of {len(run.summary)} frames solved{also}; results in {os.fspath(folder)}")
+    typer.echo(
+        f"{n} of {counted(len(run.summary), 'frame')} solved{also}; results in {os.fspath(folder)}"
+    )

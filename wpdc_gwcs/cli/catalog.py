@@ -112,7 +112,7 @@ def prepare_command(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", WPDCWarning)
             merged = read_catalog(stacked) if len(stacked) else stacked
-    counts = {"read": n_read, "further rows of a star": n_read - len(merged)}
+    counts = {"read": n_read, "repeated rows of a star": n_read - len(merged)}
     mag = numbers_or_nan(merged, "phot_g_mean_mag")
     broken = {"outside the region": ~inside(merged)}
     if min_mag is not None:
@@ -126,7 +126,7 @@ def prepare_command(
         keep &= ~mask
     if not keep.any():
         told = ", ".join(f"{rule}: {n}" for rule, n in counts.items())
-        raise InputError(f"{output}: no star is left ({told})")
+        raise InputError(f"{output}: no stars are left ({told})")
     kept = merged[keep]
     kept.remove_column("catalog_index")
     kept.meta.clear()
@@ -154,7 +154,7 @@ def info_command(
     stars = _read(catalog, region, tap_url=tap_url, cache=cache)
     stars = stars[inside(stars)]
     if len(stars) == 0:
-        raise InputError(f"{catalog}: has no star in this part of the sky")
+        raise InputError(f"{catalog}: has no stars in this part of the sky")
     for label, text in lines_about(stars):
         typer.echo(f"{label:<12}{text}")
     typer.echo("\n   mag      stars  per sq. deg  with motion  error mas")
@@ -229,7 +229,7 @@ def _sky(cone, box, around):
     from wpdc_gwcs.catalogs import Region
 
     if sum(bool(given) for given in (cone, box, around)) > 1:
-        raise InputError("only one of --cone, --box and --around can say which part of the sky")
+        raise InputError("only one of --cone, --box and --around may be given")
     try:
         if cone:
             region = Region(*_numbers("--cone", cone, 3))
@@ -261,7 +261,7 @@ def _numbers(option, text, n):
     except ValueError:
         numbers = []
     if len(numbers) != n:
-        raise InputError(f"{option} must be {n} numbers with commas between them, got {text!r}")
+        raise InputError(f"{option} must be {n} numbers separated by commas, got {text!r}")
     return numbers
 
 
@@ -274,7 +274,7 @@ def _region_of(paths):
     cones = [sky_of_frame(frame, Settings()) for frame in read_files(expand_paths(paths))]
     cones = [cone for cone in cones if cone is not None]
     if not cones:
-        raise InputError("--around: no frame has a WCS that tells where on the sky it is")
+        raise InputError("--around: no frame has a WCS that places it on the sky")
     return Region(*zip(*cones, strict=True))
 
 

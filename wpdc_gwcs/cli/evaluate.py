@@ -18,6 +18,7 @@ from wpdc_gwcs.cli.options import (
     require_free,
     require_plotting,
 )
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import FitError, InputError
 
 # More frames than this are not printed one by one.
@@ -169,7 +170,7 @@ def evaluate_command(
                 dx, dy = (np.asarray(frame.matches[name])[mask] for name in ("dx", "dy"))
                 rows.append(dict(frame=frame.name, stars=stars, **vars(evaluate(dx, dy))))
     if not rows:
-        raise InputError(f"no star of {len(frames)} frames is within the limits given")
+        raise InputError(f"no star of {counted(len(frames), 'frame')} is within the given limits")
     tables["frames"] = QTable(rows)
     compared = _compare_weights(known, names, degree, cuts) if parts["weights"] else {}
     if compared:
@@ -246,7 +247,7 @@ def _score(calibrations, folder, cuts, limit):
     scores = []
     for c in calibrations:
         if c.frame not in truth.frames:
-            raise InputError(f"{folder}: the truth has no frame {c.frame}")
+            raise InputError(f"{folder}: the simulation has no frame {c.frame}")
         try:
             scores.append(
                 score_frame(c, truth.frames[c.frame], truth.stars(c.frame), cuts=cuts, limit=limit)
@@ -266,7 +267,7 @@ def _print_tables(tables):
             typer.echo()
         first = False
         if name in ("frames", "truth") and len(tables[name]) > _MOST_FRAMES:
-            typer.echo(f"{len(tables[name])} rows of {name}: in the tables of --output FILE")
+            typer.echo(f"{counted(len(tables[name]), 'row')} of {name}: written with --output FILE")
             continue
         _print_statistics(tables[name])
 
@@ -333,7 +334,7 @@ def _compare_weights(calibrations, weights, degree, cuts):
             for detector, group in groups.items()
         }
     except FitError as err:
-        raise InputError(f"{err} (--no-weights leaves this out)") from err
+        raise InputError(f"{err} (--no-weights skips this test)") from err
     return {
         detector: [
             r.select(cuts.place(r.x, r.y, groups[detector][0].solution.crpix)) for r in results

@@ -8,6 +8,7 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.files import CalibrationFile, read_one
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
 
 # What SWarp makes of TPV is told where it is worse than for others by this factor, and not nothing.
@@ -193,7 +194,9 @@ def convert_command(
     require_free(output, overwrite)
     found = read_any(file, image_shape=None if size is None else size[::-1])
     if isinstance(found, Camera):
-        raise InputError(f"{file}: is a camera of {len(found.detectors)} detectors")
+        raise InputError(
+            f"{file}: is a camera of {counted(len(found.detectors), 'detector')}, not a single WCS"
+        )
     try:
         note = write_as(found, output, to, degree=degree, overwrite=overwrite)
     except ValueError as err:

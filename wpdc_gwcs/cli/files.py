@@ -8,6 +8,7 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import Overwrite
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
 
 CalibrationFile = Annotated[
@@ -43,8 +44,8 @@ def read_one(file):
     found = read(file)
     if isinstance(found, Camera):
         raise InputError(
-            f"{file}: is a camera of {len(found.detectors)} detectors; name the file of one, for "
-            f"example {file.parent / found.files[found.reference]}"
+            f"{file}: is a camera of {counted(len(found.detectors), 'detector')}; name one file, "
+            f"for example {file.parent / found.files[found.reference]}"
         )
     return found
 
@@ -110,7 +111,7 @@ def _transform(file, points, origin, output, overwrite, *, forward):
 def _numbers(points, names):
     if len(points) != 2:
         raise InputError(
-            f"give {names[0]} and {names[1]}, or one table; got {len(points)} values: "
+            f"give {names[0]} and {names[1]}, or one table; got {counted(len(points), 'value')}: "
             f"{' '.join(points)}"
         )
     try:

@@ -21,38 +21,52 @@ _OF_COMMANDS = (
         r"|no such file|no such configuration file)",
         "_similar",
     ),
-    (r"(?P<path>.+?): catalog must have columns 'ra'", "name its columns ra and dec, in degrees"),
+    (
+        r"(?P<path>.+?): catalog must have columns 'ra'",
+        "rename its columns to ra and dec, in degrees",
+    ),
     (
         r"(?P<path>.+?): columns .* must have a unit",
-        "wpdc catalog prepare from a copy of it with units",
+        "wpdc catalog prepare with a copy of it that has units",
     ),
     (
         r"(?P<path>.+?): (?:header must have a celestial WCS|a table of sources needs a WCS header"
         r"|must hold a header with CTYPE1|.*CD matrix must not be singular|card \S+ is missing"
         r"|.*CTYPE1 and CTYPE2 must)",
-        "--wcs HEADER with the header of another exposure, a .head file or a text file",
+        "--wcs HEADER, with the header of another exposure, a .head file or a text file",
     ),
-    (r"(?P<path>.+?): header must have the scale", "--pixel-scale ARCSEC, or --wcs HEADER"),
-    (r"(?P<path>.+?): shape of the detector must be given", "--wcs HEADER with NAXIS1 and NAXIS2"),
+    (r"(?P<path>.+?): header must have the pixel scale", "--pixel-scale ARCSEC, or --wcs HEADER"),
+    (
+        r"(?P<path>.+?): the shape of the detector must be given",
+        "--wcs HEADER, with NAXIS1 and NAXIS2 in it",
+    ),
     (
         r"(?P<path>.+?): (?:truncated|damaged|must not be empty|.*must agree with its CHECKSUM)",
         "get the file again, or leave it out",
     ),
     (
         r"(?P<path>.+?): must have an image, FITS_LDAC sources or a table",
-        "wpdc show {path} tells what it is",
+        "wpdc show {path}, which tells what it is",
     ),
     (
         r"(?P<path>.+?): must have a 'wpdc' tree|(?P<other>.+?): --solution needs",
-        "wpdc show {path} tells what it is",
+        "wpdc show {path}, which tells what it is",
     ),
     (
         r".*not a manifest of a run|.*must be of the run .* with its tables",
         "--overwrite to begin anew, or another --output",
     ),
     (r".*another solution", "the --solution of that run, or another --output"),
-    (r".*(?:No space left|File too large|Disk quota)", "another --output, on a disk with room"),
-    (r".*would both write", "name them apart, or calibrate them one by one"),
+    (
+        r".*(?:No space left|File too large|Disk quota)",
+        "another --output, on a disk with free space",
+    ),
+    (
+        r"--scheduler (?P<path>\S+): must have a worker",
+        "dask worker {path}, on machines that see the files",
+    ),
+    (r"--scheduler .*: no Dask scheduler", "dask scheduler, which prints its address"),
+    (r".*would both write", "different names, or one run for each of them"),
     (r"exposure .*left out|all \d+ exposures were left out", "wpdc explain FRAME --catalog CAT"),
 )
 # Reasons of frames that failed; the first of each kind has its hint.
@@ -62,15 +76,15 @@ _OF_FRAMES = (
      "gaia.fits"),
     (r".*too few reference stars", "a deeper catalog: wpdc catalog prepare gaia --around {frame} "
      "--output gaia.fits"),
-    (r".*of (?:different|another) shapes?|.*the frame has shape", "frames of this shape by "
-     "themselves, without --solution"),
-    (r".*the frame is of detector", "--detector NAME where the header's is wrong, or another "
+    (r".*of (?:different|another) shapes?|.*the frame has shape", "a run of its own for frames of "
+     "this shape, without --solution"),
+    (r".*the frame is from detector", "--detector NAME if the header is wrong, or another "
      "--solution"),
     (r".*it cannot be updated", "a run of these frames without --update"),
-    (r".*those of the stored solution by", "these frames without --solution; wpdc monitor tells "
-     "whether it still holds"),
-    (r".*contradicts those of the other detectors", "--no-camera where this header is right"),
-    (r".*stars agree with the solution", "more exposures of this detector in the run, or its "
+    (r".*those of the stored solution by", "a run without --solution; wpdc monitor tells whether "
+     "the solution still holds"),
+    (r".*contradicts those of the other detectors", "--no-camera if this header is right"),
+    (r".*could be fitted; at least", "more exposures of this detector in one run, or its stored "
      "--solution"),
     (r".*its process died", "fewer --jobs, so that each has more memory"),
     (r".*cannot be handed to another process", "--jobs 1"),

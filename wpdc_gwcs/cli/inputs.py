@@ -57,7 +57,7 @@ def _expand_path(one, others):
         if not found:
             raise InputError(
                 f"{one}: the folder has no FITS file and no FITS_LDAC list (.fits, .fits.fz, .cat, "
-                ".ldac, ...); name other files themselves"
+                ".ldac, ...); name other files one by one"
             )
         return found
     path, extension = re.fullmatch(r"(.*?)((?:\[[^\[\]]*\])*)", one, re.DOTALL).groups()
@@ -67,7 +67,7 @@ def _expand_path(one, others):
     pattern = re.sub(r"\[", "[[]", path)
     found = sorted(p for p in glob.glob(pattern) if os.path.realpath(p) not in others)
     if not found:
-        raise InputError(f"{one}: no file fits this pattern")
+        raise InputError(f"{one}: no file matches this pattern")
     return [p + extension for p in found]
 
 
@@ -78,9 +78,9 @@ def _lines(path):
     except OSError as err:
         raise InputError(f"@{path}: the list of files must be readable: {err.strerror}") from err
     if "\0" in text:
-        raise InputError(f"@{path}: must be a text file with a path in each line, has binary data")
+        raise InputError(f"@{path}: must be a text file with one path per line, has binary data")
     lines = [line.strip() for line in text.splitlines()]
     lines = [line for line in lines if line and not line.startswith("#")]
     if not lines:
-        raise InputError(f"@{path}: the list has no file")
+        raise InputError(f"@{path}: the list names no files")
     return lines

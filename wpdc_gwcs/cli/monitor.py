@@ -10,6 +10,7 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.files import match_files
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free, require_plotting
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
 
 # More periods than this are not told one by one.
@@ -94,7 +95,7 @@ def monitor_command(
     if not any(mine.values()):
         named = ", ".join(sorted({str(f.detector) for f in frames})[:6])
         raise InputError(
-            f"{solution}: is of detector {', '.join(solutions)}, the frames are of {named}: take "
+            f"{solution}: is for detector {', '.join(solutions)}, the frames are from {named}: use "
             "the solution that they were calibrated with"
         )
     periods = {name: _periods(found, every) for name, found in mine.items() if found}
@@ -250,7 +251,8 @@ def _follow(solution, periods, false_alarm):
 def _tell(name, drift, n_frames):
     verdict = "has drifted" if drift.drifted else "no drift found"
     typer.echo(
-        f"{name}: {verdict} (p = {drift.p_value:.2g}, {drift.n_stars} stars in {n_frames} frames)"
+        f"{name}: {verdict} (p = {drift.p_value:.2g}, {counted(drift.n_stars, 'star')} in "
+        f"{counted(n_frames, 'frame')})"
     )
     if drift.drifted:
         typer.echo(f"  by {drift.amplitude:.4f} px rms in {drift.area:.0%} of the detector")
@@ -266,16 +268,18 @@ def _tell(name, drift, n_frames):
 def _tell_history(history):
     alarms = history.alarms
     untested = int(np.sum(~np.isfinite(history.periods["p_value"])))
-    also = f", {untested} of too few stars" if untested else ""
+    also = f", {untested} with too few stars" if untested else ""
     typer.echo(
-        f"{history.detector}: {len(alarms)} alarms in {len(history.periods)} periods{also}, "
-        f"{int(np.sum(history.periods['n_frames']))} frames"
+        f"{history.detector}: {counted(len(alarms), 'alarm')} in "
+        f"{counted(len(history.periods), 'period')}{also}, "
+        f"{counted(int(np.sum(history.periods['n_frames'])), 'frame')}"
     )
     for row in alarms[:_MOST_PERIODS]:
         typer.echo(
             f"  {row['first_epoch']:.4f} to {row['last_epoch']:.4f}: drifted by "
             f"{row['amplitude'].value:.4f} px rms in {row['area']:.0%} of the detector "
-            f"(p = {row['p_value']:.2g}, {row['n_stars']} stars in {row['n_frames']} frames)"
+            f"(p = {row['p_value']:.2g}, {counted(row['n_stars'], 'star')} in "
+            f"{counted(row['n_frames'], 'frame')})"
         )
     if len(alarms) > _MOST_PERIODS:
         typer.echo(f"  and {len(alarms) - _MOST_PERIODS} more: in the table of --output FILE")

@@ -338,7 +338,7 @@ def state_first_pixel(frames):
         more = f" and {len(untold) - 1} more" if len(untold) > 1 else ""
         log.warning(
             "%s%s: nothing tells whether x and y count from 0 or from 1: the first pixel was taken "
-            "for 0 (--origin 1 if it is 1)",
+            "to be 0 (--origin 1 if it is 1)",
             untold[0],
             more,
         )

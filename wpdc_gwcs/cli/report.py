@@ -8,6 +8,7 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.options import Overwrite, Quiet, require_free, require_plotting
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import FileFormatError
 
 
@@ -30,7 +31,7 @@ def report_command(
     require_free(output, overwrite)
     n_frames = write_page(folder, output, overwrite=overwrite)
     if not quiet:
-        typer.echo(f"{output}: report of {n_frames} frames")
+        typer.echo(f"{output}: report of {counted(n_frames, 'frame')}")
 
 
 class _Matches(Mapping):

@@ -29,6 +29,7 @@ from wpdc_gwcs.cli.options import (
     settings_of,
 )
 from wpdc_gwcs.cli.stages import one_frame
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import FileFormatError, FrameError, InputError
 
 Picture = Annotated[
@@ -269,7 +270,7 @@ def _of_fits(file):
         lines.append((frame.name, f"{kind} of {nx} x {ny} px, detector {frame.detector}, {epoch}"))
         lines.append(("", f"center by the header at RA {float(ra):.5f} Dec {float(dec):.5f} deg"))
     if len(frames) > _MOST_ROWS:
-        lines.append(("...", f"{len(frames) - _MOST_ROWS} more frames"))
+        lines.append(("...", counted(len(frames) - _MOST_ROWS, "more frame")))
     first = frames[0]
 
     def draw():

@@ -290,7 +290,7 @@ def _densities(text, n_fields):
         return read_numbers("--density", text)
     low, high = read_numbers("--density", text, 2, ":")
     if not 0 < low <= high:
-        raise InputError(f"--density LOW:HIGH must be positive and rise, got {text!r}")
+        raise InputError(f"--density LOW:HIGH must be positive and increasing, got {text!r}")
     return np.geomspace(low, high, n_fields)
 
 

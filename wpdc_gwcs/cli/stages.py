@@ -32,6 +32,7 @@ from wpdc_gwcs.cli.options import (
     settings_of,
     state_first_pixel,
 )
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
 
 log = logging.getLogger("wpdc_gwcs.cli")
@@ -59,7 +60,7 @@ def one_frame(path, **options):
     frames = read_frames(path, **options)
     if len(frames) > 1:
         names = ", ".join(frame.source for frame in frames)
-        raise InputError(f"{path}: has {len(frames)} frames, choose one with path[EXT]: {names}")
+        raise InputError(f"{path}: has {len(frames)} frames; choose one with path[EXT]: {names}")
     return frames[0]
 
 
@@ -98,7 +99,7 @@ def detect_command(
     write_table(sources, output, overwrite=overwrite)
     if not quiet:
         clean = int((sources["flags"] == 0).sum())
-        typer.echo(f"{output}: {len(sources)} sources, {clean} of them without flags")
+        typer.echo(f"{output}: {counted(len(sources), 'source')}, {clean} of them without flags")
 
 
 @app.command("match", no_args_is_help=True)
@@ -151,7 +152,7 @@ def match_command(
     source = catalog_source(catalog, url=tap_url, cache=cache, max_mag=max_mag)
     matched = match_frame(one, source, settings)
     if one.epoch is None and "pmra" in matched.reference.colnames:
-        log.warning("%s has no epoch: the stars' motions were not applied (--epoch)", one.source)
+        log.warning("%s: no epoch is known: proper motions were not applied (--epoch)", one.source)
     i, j = matched.pairs
     x, y = (np.asarray(matched.sources[name], float)[i] for name in ("x", "y"))
     ra, dec = (np.asarray(matched.reference[name], float)[j] for name in ("ra", "dec"))
@@ -169,7 +170,7 @@ def match_command(
     if not quiet:
         found = matched.diagnostics
         typer.echo(
-            f"{output}: {len(table)} pairs, {found.expected_by_chance:.1f} expected by chance "
-            f"({found.significance:.1f} sigma), purity {found.purity:.4f}, "
+            f"{output}: {counted(len(table), 'pair')}, {found.expected_by_chance:.1f} expected by "
+            f"chance ({found.significance:.1f} sigma), purity {found.purity:.4f}, "
             f"{found.n_ambiguous} ambiguous left out"
         )

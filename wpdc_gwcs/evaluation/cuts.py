@@ -127,7 +127,9 @@ class Cuts:
             if low is None and high is None:
                 continue
             if name not in stars.colnames:
-                raise ValueError(f"a limit on {name} needs this column, which the stars have not")
+                raise ValueError(
+                    f"a limit on {name} needs this column, which the stars do not have"
+                )
             values = np.asarray(stars[name], float)
             with np.errstate(invalid="ignore"):
                 inside &= values > low if low is not None else np.isfinite(values)

@@ -14,6 +14,7 @@ from astropy.table import QTable, Table
 from scipy.ndimage import median
 from scipy.special import chdtrc
 
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.robust import robust_scatter
 
 __all__ = ["Drift", "detect_drift", "mean_in_cells"]
@@ -148,8 +149,8 @@ def detect_drift(solution, matches, *, false_alarm=0.01):
     p_values = np.concatenate([g.p_value for g in grids.values()])
     if len(p_values) == 0:
         raise ValueError(
-            f"no part of the detector has {_MIN_STARS} stars: {stars.x.size} stars are too few "
-            "to test"
+            f"no part of the detector has {_MIN_STARS} stars: {counted(stars.x.size, 'star')} in "
+            "all, too few to test"
         )
     p_value = float(min(1.0, 2 * min(p_values.min() * len(p_values), _whole(solution, grids))))
     drifted = bool(p_value < false_alarm)

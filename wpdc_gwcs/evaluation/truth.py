@@ -117,7 +117,7 @@ def score_frame(calibration, truth, stars, *, cuts=None, limit=0.01, n_grid=101)
         raise ValueError("score_frame needs a calibrated frame with its matches")
     if tuple(solution.image_shape) != tuple(truth.image_shape):
         raise ValueError(
-            f"frame {calibration.frame} must be of shape {truth.image_shape} as its truth, is of "
+            f"frame {calibration.frame} must have the shape of its truth, {truth.image_shape}, has "
             f"{tuple(solution.image_shape)}"
         )
     cuts = Cuts() if cuts is None else cuts
@@ -230,7 +230,7 @@ def pool_scores(scores):
         If there are no scores.
     """
     if not isinstance(scores, Sequence) or not scores:
-        raise ValueError("pool_scores needs the scores of frames")
+        raise ValueError("pool_scores needs the scores of at least one frame")
     groups = {}
     for score in scores:
         groups.setdefault(score.detector, []).append(score)

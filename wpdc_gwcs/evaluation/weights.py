@@ -77,7 +77,7 @@ class WeightResult:
         """
         near = None if self.distance is None else self.distance <= radius
         if near is None or not near.any():
-            raise ValueError(f"no star is known within {radius:g} px of the reference point")
+            raise ValueError(f"no star is within {radius:g} px of the reference point")
         return self.select(near)
 
     def select(self, chosen):

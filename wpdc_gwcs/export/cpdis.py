@@ -82,7 +82,7 @@ def _prior_shift(obj, x, y):
             break
     shift = np.linalg.solve(cd, v - u)
     if not np.isfinite(shift).all():
-        raise FileFormatError("look-up table cannot be carried in front of the polynomial")
+        raise FileFormatError("the look-up table cannot be carried through the polynomial")
     return shift.reshape(2, *shape)
 
 

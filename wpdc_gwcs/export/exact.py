@@ -94,7 +94,7 @@ def require_shape(obj):
     """
     shape = image_shape_of(obj)
     if shape is None:
-        raise FileFormatError("shape of the detector must be known for this format, is unknown")
+        raise FileFormatError("the shape of the detector must be known for this format, is unknown")
     return shape
 
 

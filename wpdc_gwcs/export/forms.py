@@ -109,7 +109,9 @@ def make_form(obj, form, *, degree=None, versions: Mapping = MappingProxyType({}
         return FitsForm(form, header, deviation=worst, inverse_deviation=inverse_worst)
     if form == "tab":
         if degree is not None:
-            raise ValueError(f"degree has no meaning for 'tab', which has no polynomials: {degree}")
+            raise ValueError(
+                f"degree has no meaning for 'tab', which has no polynomials, got {degree}"
+            )
         header, tables, worst = tab_form(obj, version=versions.get(TAB_NAME, 1))
         return FitsForm(form, header, tuple(tables), worst)
     written = obj if degree is None else refit(obj, degree)

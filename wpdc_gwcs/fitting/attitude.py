@@ -123,7 +123,7 @@ def fit_attitude(x, y, ra, dec, *, crpix, crval, cd, x_err=None, y_err=None, cli
         kept &= np.isfinite(plane).all(0)
         if kept.sum() < MIN_STARS_ATTITUDE:
             raise FitError(
-                f"{kept.sum()} of {n} stars are left for the attitude, at least "
+                f"{kept.sum()} of {n} stars are left to fit the attitude; at least "
                 f"{MIN_STARS_ATTITUDE} are needed"
             )
         inverse = np.linalg.inv(cd)

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import FitError
 
 __all__ = ["LinearSolution", "solve_linear"]
@@ -53,12 +54,14 @@ def solve_linear(design, target, weight=None, *, leverage=False):
         design = design * root_weight[:, None]
         target = target * (root_weight if target.ndim == 1 else root_weight[:, None])
     if n < p:
-        raise FitError(f"{n} stars of non-zero weight cannot determine {p} coefficients")
+        raise FitError(
+            f"{counted(n, 'star')} of non-zero weight cannot determine {counted(p, 'coefficient')}"
+        )
     scale = np.sqrt(np.einsum("ij,ij->j", design, design))
     if not np.all(scale > 0):
         raise FitError(
-            f"{int(np.sum(~(scale > 0)))} of {p} coefficients have no weight: the weights are "
-            "zero or vanish at the stars"
+            f"{int(np.sum(~(scale > 0)))} of {p} coefficients cannot be determined: "
+            "their terms or the weights are zero at all stars"
         )
     # QR first: the SVD is then of a small triangle, whatever the number of stars.
     q, r = np.linalg.qr(design / scale)

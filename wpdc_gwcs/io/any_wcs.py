@@ -96,7 +96,9 @@ def _read_header(path, image_shape):
         if found.solution.image_shape is not None:
             return found
         if image_shape is None:
-            raise InputError(f"{path}: the size of the image must be given, the header has none")
+            raise InputError(
+                f"{path}: the size of the image must be given (--size): the header does not have it"
+            )
         solution = dataclasses.replace(found.solution, image_shape=tuple(image_shape))
         return dataclasses.replace(found, solution=solution)
     return _fit(read_wcs(path), path, image_shape or header_shape(header))

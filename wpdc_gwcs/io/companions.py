@@ -405,7 +405,7 @@ def _bad_pixels(values, header, bits, load_image, mask):
                 continue
         bad |= has
     if bad.all():
-        warnings.warn(f"{where}: marks all pixels as bad, and is left aside", WPDCWarning)
+        warnings.warn(f"{where}: marks all pixels as bad and is ignored", WPDCWarning)
         return ~bad
     return bad
 
@@ -468,7 +468,7 @@ def load_weight(companion, shape):
     if good.mean() < 0.05:
         warnings.warn(
             f"{companion.path}[{companion.index}]: {companion.role} must be positive, is so for "
-            f"{good.mean():.1%} of the pixels, and is left aside",
+            f"{good.mean():.1%} of the pixels, and is ignored",
             WPDCWarning,
         )
         return None

@@ -118,7 +118,9 @@ def write_into(
     if file_kind(path) != "fits":
         raise FileFormatError(f"{path}: must be a FITS image")
     if output is None and not os.access(path, os.W_OK):
-        raise InputError(f"{path}: image must be writable, is not; a copy can be written instead")
+        raise InputError(
+            f"{path}: the image must be writable, is not; a copy can be written instead"
+        )
     with _named(image):
         parts = _read_parts(path)
         number = _choose(parts, extension, path)
@@ -361,6 +363,6 @@ def _check(obj, made, path, number, image):
     expected = made.keywords_deviation if made.form == "fits" else made.deviation
     if not found <= _READ_BACK * expected + _ROUNDING_PX:
         raise FileFormatError(
-            f"{image}: other cards of the header have a say in the WCS: it would deviate by "
+            f"{image}: other cards of the header interfere with the WCS: it would deviate by "
             f"{found:.3g} px instead of {expected:.3g} px"
         )

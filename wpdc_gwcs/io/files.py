@@ -395,16 +395,16 @@ def check_output(path, *, overwrite):
         reason = getattr(problem, "strerror", None) or first_line(problem)
         raise InputError(f"{path}: cannot be written: {reason}") from problem
     if mode is not None and stat.S_ISDIR(mode):
-        raise InputError(f"{path}: output must be a file, this is a folder")
+        raise InputError(f"{path}: the output must be a file, is a folder")
     if mode is not None and not stat.S_ISREG(mode):
         # To replace a device by a file takes it from everyone.
-        raise InputError(f"{path}: output must be a file, this is a device, pipe or socket")
+        raise InputError(f"{path}: the output must be a file, is a device, pipe or socket")
     if mode is not None and not overwrite:
         raise OutputExistsError(f"{path}: file exists and is kept; overwriting must be asked for")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: output folder must exist, found no {path.parent}")
+        raise InputError(f"{path}: the output folder must exist, found no {path.parent}")
     if not os.access(path.parent, os.W_OK):
-        raise InputError(f"{path}: output folder must be writable, {path.parent} is not")
+        raise InputError(f"{path}: the output folder must be writable, {path.parent} is not")
 
 
 def place(temporary, path, *, overwrite):

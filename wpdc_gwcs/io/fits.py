@@ -197,7 +197,7 @@ def read_fits(path):
     tan = parse_tan(header, name=name, ignore_tables=table is not None)
     if tan is None:
         raise FileFormatError(
-            f"{name}: header must be TAN or TPV without look-up tables of others to be a "
+            f"{name}: header must be TAN or TPV without foreign look-up tables to be a "
             f"calibration, got {header_text(header, 'CTYPE1')!r}; as a starting WCS it can be read"
         )
     if instrument is None or not _agree(instrument, tan):
@@ -244,7 +244,7 @@ def _require_no_tables(header, path):
     if "WPDCTAB" in header:
         raise FileFormatError(
             f"{path}: must have the tables WPDC_... that its keyword WPDCTAB refers to, has none: "
-            "cut short, or a header that was copied without them (export it as tpv or head)"
+            "it was cut short, or the header was copied without them (export it as tpv or head)"
         )
 
 

@@ -199,7 +199,8 @@ def read_frames(
             )
         if headers is not None and len(headers) == 1 < len(chosen):
             raise FrameError(
-                f"{path}: has {len(chosen)} frames, one WCS header cannot be that of all"
+                f"{path}: has {len(chosen)} frames, which cannot share one WCS header; give one "
+                "for each"
             )
         several = len(_choose(hdus, path, None, quiet=True)[0]) > 1
         prepared = [
@@ -290,7 +291,7 @@ def _refuse_planes(where, given):
     """Refuse masks and weights of what has no pixels."""
     for path in given.values():
         if path is not None:
-            raise FrameError(f"{where}: is a source list, which has no use for {path}")
+            raise FrameError(f"{where}: is a source list, for which {path} is of no use")
 
 
 def _companions(part, companions, given, beside):
@@ -497,12 +498,12 @@ def _guess_shape(sources, where):
     x, y = (np.asarray(sources[c]) for c in ("x", "y"))
     if not (np.isfinite(x).any() and np.isfinite(y).any()):
         raise FrameError(
-            f"{where}: shape of the detector must be given (NAXIS1, NAXIS2), is unknown"
+            f"{where}: the shape of the detector must be given (NAXIS1, NAXIS2), is unknown"
         )
     shape = tuple(int(np.ceil(np.nanmax(v) + 0.5)) for v in (y, x))
     warnings.warn(
         f"{where}: the header does not tell the shape of the detector; {shape[1]} x {shape[0]} px, "
-        "the reach of the sources, is taken for it",
+        "the extent of the sources, is assumed",
         WPDCWarning,
     )
     return shape

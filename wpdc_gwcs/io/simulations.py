@@ -156,7 +156,7 @@ def write_simulation(
         tables.append(directory / f"{exposure.name}.truth.ecsv")
     for path in [catalog, truth, *frames, *tables, *(h for h in headers if h is not None)]:
         if path.exists() and not overwrite:
-            raise OutputExistsError(f"{path} exists; overwrite is not set")
+            raise OutputExistsError(f"{path}: file exists and is kept")
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as problem:

@@ -19,6 +19,7 @@ from astropy.table import Table
 from wpdc_gwcs.catalogs import read_lines, read_table_file
 from wpdc_gwcs.columns import find_name, listed, read_numbers, spelled_names
 from wpdc_gwcs.copies import group_copies
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import FrameError, WPDCWarning
 from wpdc_gwcs.flags import FLAG_BAD_PIXEL, FLAG_BLENDED, FLAG_EDGE, FLAG_SATURATED
 from wpdc_gwcs.io.files import READ_ERRORS, first_line, open_fits
@@ -374,8 +375,8 @@ def standardize_sources(table, *, name="sources", origin=None):
     again = _copies(sources)
     if again.any():
         warnings.warn(
-            f"{name}: {again.sum()} of {len(sources)} rows are further rows of a source that is "
-            "there already: one row of each source is used",
+            f"{name}: {again.sum()} of {len(sources)} rows repeat a source that another row has: "
+            "one row per source is used",
             WPDCWarning,
         )
         sources["x"][again] = sources["y"][again] = np.nan
@@ -391,8 +392,8 @@ def _position(table, label, name):
     if unreadable.any():
         row = int(np.flatnonzero(unreadable)[0])
         warnings.warn(
-            f"{name}: {unreadable.sum()} of {len(values)} rows are left out: column {label!r} "
-            f"cannot be read ({str(table[label][row])!r} in row {row})",
+            f"{name}: {unreadable.sum()} of {counted(len(values), 'row')} left out: column "
+            f"{label!r} cannot be read ({str(table[label][row])!r} in row {row})",
             WPDCWarning,
         )
     return values

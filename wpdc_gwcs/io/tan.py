@@ -207,7 +207,7 @@ def _require_area(pv, cd, crpix, shape, name, error):
     place = crpix + 1.0 if shape is None else 0.3 * np.array(shape[::-1])
     area = np.linalg.det(pv.jacobian(*(cd @ (place - crpix))))
     if not abs(area) > 0:
-        raise error(f"{name}: PV terms must not put all pixels into one line or point, do so")
+        raise error(f"{name}: PV terms must not collapse all pixels to a line or point, do so")
 
 
 def idle_pv(header):
@@ -286,9 +286,7 @@ def _linear(header, order, number, name, error):
             steps = [number(f"CDELT{i}", required=False, default=1.0) for i in (1, 2)]
             return np.array(steps)[:, None] * np.array(pc)
     if "CDELT1" not in header and "CDELT2" not in header:
-        raise error(
-            f"{name}: header must have the scale of the pixels in CD, PC or CDELT, has none"
-        )
+        raise error(f"{name}: header must have the pixel scale in CD, PC or CDELT, has none")
     cdelt = np.array([number("CDELT1"), number("CDELT2")])
     lon, lat = order
     rho = np.radians(number(f"CROTA{lat + 1}", required=False, default=0.0))

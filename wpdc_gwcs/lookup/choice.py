@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.lookup._smoother import (
     MAX_DEGREE,
@@ -95,8 +96,9 @@ def choose_table(residual_map, *, lut="auto"):
     if not carries_table(residual_map):
         if lut == "always":
             raise FitError(
-                f"{residual_map.n_stars} stars in {np.sum(residual_map.counts > 0)} bins cannot "
-                f"carry a look-up table, {MIN_STARS_TABLE} all over the detector are needed"
+                f"{counted(residual_map.n_stars, 'star')} in "
+                f"{counted(np.sum(residual_map.counts > 0), 'bin')} cannot determine a look-up "
+                f"table; {MIN_STARS_TABLE} all over the detector are needed"
             )
         return TableChoice("none"), ()
     return _choose(join_bins(residual_map), allow_none=lut == "auto")

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import gammaln, pdtr, pdtrc
 
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.matching._mapping import count_terms
 from wpdc_gwcs.matching._pairs import find_edges, one_to_one
@@ -124,22 +125,22 @@ class Evidence:
                     f"stars counted: {self.search_significance:.1f})"
                 )
             return (
-                f"{self.n_pairs} pairs with {self.expected_by_chance:.3g} expected by chance "
-                f"have a significance of {self.significance:.1f} sigma, "
-                f"{min_significance:g} are needed{searched}"
+                f"{counted(self.n_pairs, 'pair')}, with {self.expected_by_chance:.3g} expected by "
+                f"chance: a significance of {self.significance:.1f} sigma; "
+                f"{min_significance:g} is needed{searched}"
             )
         if self.purity < min_purity:
             return (
-                f"of {self.n_pairs} pairs {self.expected_by_chance:.3g} are expected by chance: "
-                f"a purity of {self.purity:.3f}, {min_purity:g} is needed"
+                f"{counted(self.n_pairs, 'pair')}, with {self.expected_by_chance:.3g} expected by "
+                f"chance: a purity of {self.purity:.3f}; {min_purity:g} is needed"
             )
         bad = [a for a in self.areas if not a.accepted]
         if bad:
             worst = max(bad, key=lambda a: a.expected - a.n_pairs)
             return (
                 f"{len(bad)} of {sum(a.judged for a in self.areas)} parts of the frame lack pairs; "
-                f"worst is {worst.radius:.0f} px about ({worst.x:.0f}, {worst.y:.0f}): "
-                f"{worst.n_pairs} pairs, {worst.expected:.0f} expected, "
+                f"the worst lies within {worst.radius:.0f} px of ({worst.x:.0f}, {worst.y:.0f}): "
+                f"{counted(worst.n_pairs, 'pair')}, {worst.expected:.0f} expected, "
                 f"{worst.expected_by_chance:.2g} by chance"
             )
         return ""

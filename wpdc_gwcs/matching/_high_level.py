@@ -7,6 +7,7 @@ from astropy.table import QTable
 from astropy.wcs.wcsapi import HighLevelWCSWrapper
 
 from wpdc_gwcs.columns import convert, read_numbers, unit_of
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._core import match_planes
 from wpdc_gwcs.models import local_plane, project
@@ -100,7 +101,7 @@ def match_sources(
     rules = judge_sources(columns, max_roundness=max_roundness, min_snr=min_snr)
     rows = np.flatnonzero(~np.any(list(rules.values()), axis=0))
     if len(rows) == 0:
-        raise MatchError(f"none of {len(x)} sources can be used: {left_out(rules)}")
+        raise MatchError(f"no source can be used: {left_out(rules)}")
     pixels = _tangent_plane(wcs, image_shape)
     sky = wcs.pixel_to_world(x[rows], y[rows]).icrs
     xs, ys = pixels(sky.ra.deg, sky.dec.deg)
@@ -249,7 +250,7 @@ def _find_shape(wcs, x, y):
     if shape is not None:
         return tuple(int(n) for n in shape)
     if not (np.isfinite(x) & np.isfinite(y)).any():
-        raise MatchError(f"none of {len(x)} sources has a finite position")
+        raise MatchError(f"none of {counted(len(x), 'source')} has a finite position")
     return int(np.ceil(np.nanmax(y))) + 1, int(np.ceil(np.nanmax(x))) + 1
 
 
@@ -267,9 +268,9 @@ def _tangent_plane(wcs, image_shape):
 
     crval, cd = local_plane(sky, *center, step=0.5)
     if not np.isfinite(crval).all():
-        raise ValueError("wcs gives no sky position for the center of the frame")
+        raise ValueError("wcs must have a sky position at the center of the frame, has none")
     if not np.isfinite(cd).all() or abs(np.linalg.det(cd)) == 0:
-        raise ValueError("wcs is degenerate in the center of the frame")
+        raise ValueError("wcs must be invertible at the center of the frame, is not")
 
     def pixels(ra, dec):
         plane = np.array(project(ra, np.where(np.abs(dec) <= 90, dec, np.nan), crval))

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import gammaln
 
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._diagnostics import MatchDiagnostics
 from wpdc_gwcs.matching._mapping import SmoothMap
@@ -108,8 +109,8 @@ def match_nearby(
         )
     if len(sources) < MIN_PAIRS or len(reference) < MIN_PAIRS:
         raise MatchError(
-            f"too few stars to match: {len(sources)} sources and {len(reference)} reference stars "
-            f"in reach, {MIN_PAIRS} are needed"
+            f"too few stars to match: {counted(len(sources), 'source')} and "
+            f"{counted(len(reference), 'reference star')} in reach; {MIN_PAIRS} of each are needed"
         )
     center = np.array([0.5 * (image_shape[1] - 1), 0.5 * (image_shape[0] - 1)])
     scale = 0.5 * np.hypot(*image_shape)
@@ -122,13 +123,13 @@ def match_nearby(
         if grown is not None:
             candidates.append(grown)
     if not candidates:
-        raise MatchError("no pairs where the neighbors of the detector predict them")
+        raise MatchError("no pairs where the neighboring detectors predict them")
     candidates.sort(key=lambda c: c.log_chance)
     best = candidates[0]
     n = len(best.pairs[0])
     if n < MIN_PAIRS or best.log_chance > np.log(_MAX_CHANCE):
         raise MatchError(
-            f"{n} pairs where the neighbors of the detector predict them, "
+            f"{counted(n, 'pair')} where the neighboring detectors predict them, "
             f"{best.by_chance:.2g} expected by chance: not enough to be sure"
         )
     for other in candidates[1:]:

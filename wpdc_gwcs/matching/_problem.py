@@ -121,7 +121,7 @@ def prepare_problem(
     ):
         if len(points) < MIN_STARS:
             raise MatchError(
-                f"too few {name} to match: {len(points)} with usable positions, "
+                f"too few {name} to match: {len(points)} with usable positions; "
                 f"{MIN_STARS} are needed"
             )
     return Problem(

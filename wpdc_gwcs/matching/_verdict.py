@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._evidence import Evidence, collect_evidence, judge_few
 from wpdc_gwcs.matching._growth import (
@@ -189,10 +190,10 @@ def prefer(one, other):
         return better
     gap = np.median(np.hypot(*(one.mapped - other.mapped).T))
     raise MatchError(
-        f"the match is ambiguous: {one.evidence.n_pairs} pairs "
-        f"({one.evidence.significance:.1f} sigma) and {other.evidence.n_pairs} pairs "
+        f"the match is ambiguous: {counted(one.evidence.n_pairs, 'pair')} "
+        f"({one.evidence.significance:.1f} sigma) and {counted(other.evidence.n_pairs, 'pair')} "
         f"({other.evidence.significance:.1f} sigma) of two mappings that are {gap:.4g} px "
-        "apart suit about equally well: the field or the catalog repeats itself"
+        "apart fit about equally well: the field or the catalog repeats itself"
     )
 
 
@@ -222,7 +223,7 @@ def without_rival(problem, match, clock):
             return match
         match = better
     raise MatchError(
-        f"the match is ambiguous: {_MOST_RIVALS} times over another shift suited the sources "
+        f"the match is ambiguous: {_MOST_RIVALS} times in a row, another shift fitted the sources "
         "better: the field or the catalog repeats itself"
     )
 
@@ -257,7 +258,7 @@ def header_error(problem, match):
         if value > most:
             return MatchError(
                 f"the {what} of the starting WCS is off by {value:.4g} {unit}, "
-                f"{most:.4g} {unit} are allowed; {_HINT}",
+                f"at most {most:.4g} {unit} is allowed; {_HINT}",
                 found={
                     "shift": tuple(map(float, shift)),
                     "rotation": float(turned[1]),
@@ -275,11 +276,12 @@ def refusal(problem, attempts, *, hint):
     else:
         reason = (
             attempts.best.missing(problem.options)
-            or "the pairs of a part do not carry over to the frame"
+            or "the pairs found in one part do not carry over to the whole frame"
         )
     return MatchError(
-        f"no match with sufficient evidence ({n_sources} sources, {n_reference} reference stars in "
-        f"reach): {reason}" + (f"; {_HINT}" if hint else "")
+        f"no match with sufficient evidence ({counted(n_sources, 'source')}, "
+        f"{counted(n_reference, 'reference star')} in reach): {reason}"
+        + (f"; {_HINT}" if hint else "")
     )
 
 

@@ -41,7 +41,7 @@ def fold_attitude(pv, matrix):
             matrix @ matrix.T, length**2 * np.eye(2), rtol=0, atol=1e-12 * length**2
         ):
             raise FileFormatError(
-                "PV with radial terms can only be turned and scaled as a whole, "
+                "a PV polynomial with radial terms can only be rotated and scaled as a whole, "
                 f"got the matrix {matrix.tolist()}"
             )
         radial = (matrix @ radial) * length ** -np.arange(radial.shape[1], dtype=float)

@@ -185,7 +185,7 @@ def _fit(fitter, pv, exposure, crpix, weight):
         where = "" if weight.name == "uniform" else f" within r0 = {weight.r0:.6g} px"
         raise FitError(
             f"a polynomial of degree {pv.degree} needs more than {n_terms} stars{where} in every "
-            f"exposure with method='paper', there are {inside}"
+            f"exposure with method='paper', has {inside}"
         )
     cd = np.asarray(exposure.cd)
     reference = np.array(project(exposure.ra, exposure.dec, exposure.crval))[:, used]

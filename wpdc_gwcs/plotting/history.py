@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.plotting._style import BLACK, BLUE, DIVERGING, GREY, ORANGE, new_figure
 
 __all__ = ["plot_cell_history", "plot_drift_history"]
@@ -56,8 +57,9 @@ def plot_drift_history(history):
     figure.legend(handles, labels, loc="outside upper right", ncols=len(labels), frameon=False)
     n = int(drifted.sum())
     means.set_title(
-        f"{history.detector}: {len(table)} periods, {int(np.sum(table['n_frames']))} frames, "
-        f"{n} alarm{'s' * (n != 1)}",
+        f"{history.detector}: {counted(len(table), 'period')}, "
+        f"{counted(int(np.sum(table['n_frames'])), 'frame')}, "
+        f"{counted(n, 'alarm')}",
         loc="left",
     )
     return figure

@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 from astropy.table import Table, vstack
 
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.evaluation import evaluate
 from wpdc_gwcs.report.figures import detector_figures, frame_figures
 from wpdc_gwcs.report.template import PAGE
@@ -104,7 +105,7 @@ def write_report(summary, solutions, matches, file, *, title="Calibration report
             link = f"detector-{k}"
             text = _describe(solutions.get(name), table)
             if len(chosen) < len(mine):
-                text += f"  Pooled are {len(chosen)} of its {len(mine)} frames, evenly chosen."
+                text += f"  Pooled over {len(chosen)} of its {len(mine)} frames, evenly chosen."
             small = len(names) > _FEW_DETECTORS
             figures = detector_figures(name, solutions.get(name), table, small=small)
             title = f"Detector {name}"
@@ -164,7 +165,7 @@ def _plain_numbers(column):
 def _counts(summary):
     states = [str(s) for s in summary["status"]]
     parts = [f"{states.count(s)} {s}" for s in ("solved", "degraded", "failed") if states.count(s)]
-    return f"{len(states)} frame{'s' * (len(states) != 1)}: {', '.join(parts)}."
+    return f"{counted(len(states), 'frame')}: {', '.join(parts)}."
 
 
 def _contents(sections, ids, about):
@@ -292,12 +293,12 @@ def _frame_table(table):
 def _describe(solution, table):
     """Say in a few words what the solution of a detector is."""
     if solution is None:
-        return "No solution of it is at hand."
+        return "No solution is stored for it."
     ny, nx = solution.image_shape
     text = f"{nx} x {ny} px"
     if "n_used" in solution.statistics:
         stars, exposures = (solution.statistics[name] for name in ("n_used", "n_exposures"))
-        text += f"; {stars} residuals of {exposures} exposure{'s' * (exposures != 1)}"
+        text += f"; {counted(stars, 'residual')} of {counted(exposures, 'exposure')}"
     if solution.settings.get("method") == "paper":
         text += ", by the paper's literal method"
     if solution.valid_from is not None or solution.valid_to is not None:

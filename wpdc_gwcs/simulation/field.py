@@ -326,7 +326,7 @@ def _the_camera(camera, detectors, seed, options):
     if isinstance(camera, SimulatedCamera):
         if options:
             raise TypeError(
-                f"a camera of your own has its options already, not {', '.join(options)}: "
+                f"a Camera has its options already and takes no {', '.join(options)}: "
                 "dataclasses.replace makes another"
             )
     else:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.exceptions import FitError
 
@@ -200,8 +201,8 @@ def gather(frames, shapes, crpix):
             value = np.ravel(np.asarray(value, dtype=float))
             if value.size != s.stop - s.start:
                 raise ValueError(
-                    f"exposure {frame.name}: {name} has {value.size} values, x has "
-                    f"{s.stop - s.start}"
+                    f"exposure {frame.name}: {name} must have as many values as x, has "
+                    f"{value.size}, x has {s.stop - s.start}"
                 )
             columns[name][s] = value
         if frame.x_err is not None and frame.y_err is not None:
@@ -218,7 +219,7 @@ def gather(frames, shapes, crpix):
     if not np.any(valid):
         shape = detectors[0].image_shape
         raise FitError(
-            f"none of {n} pairs can be used: {int((~finite).sum())} have NaN positions, "
+            f"none of {counted(n, 'pair')} can be used: {int((~finite).sum())} have NaN positions, "
             f"{int((finite & ~inside).sum())} lie off the detector of {shape[1]} x {shape[0]} px, "
             f"{int(bad_error.sum())} have errors that are NaN, infinite or not positive, "
             f"{n - allowed} are held out"
