@@ -218,7 +218,7 @@ def test_no_more_is_in_hand_than_keeps_the_workers_busy(inputs, pairs, monkeypat
 
 def test_calibrations_are_left_to_the_files_only_where_there_are_any(inputs):
     frames, reference, *_ = inputs
-    with pytest.raises(ValueError, match="keep=False needs an output folder"):
+    with pytest.raises(ValueError, match="keep=False needs output"):
         calibrate(frames[:1], reference, keep=False)
 
 
@@ -288,7 +288,7 @@ class TestPaths:
         assert expand_paths(["@b", "@"]) == ["@b", "@"]
         for name, text, message in (
             ("none", None, "@none: the list of files must be readable: No such file"),
-            ("empty.txt", b"# nothing\n", "the list has no file"),
+            ("empty.txt", b"# nothing\n", "the list names no files"),
             ("x.fits", b"\0\1", "must be a text file with a path in each line"),
         ):
             if text is not None:

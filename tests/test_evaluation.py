@@ -193,7 +193,7 @@ def test_uncertain_table_explains_a_small_offset():
 
 def test_drift_needs_stars_and_a_probability():
     rng = np.random.default_rng(16)
-    with pytest.raises(ValueError, match="5 stars are too few to test"):
+    with pytest.raises(ValueError, match="5 stars in all, too few to test"):
         detect_drift(make_solution(0.001), make_matches(rng, 5))
     with pytest.raises(ValueError, match="false_alarm must be between 0 and 1, got 2"):
         detect_drift(make_solution(0.001), make_matches(rng, 500), false_alarm=2)

@@ -124,7 +124,7 @@ def test_pooled_scores_tell_what_frames_share(straight):
     table = tabulate_scores(scores)
     assert "error_x" not in table.colnames
     assert len(table) == 2
-    with pytest.raises(ValueError, match="pool_scores needs the scores of frames"):
+    with pytest.raises(ValueError, match="pool_scores needs the scores of at least one frame"):
         pool_scores([])
 
 
@@ -235,7 +235,7 @@ def test_truth_of_another_simulation(results, tmp_path, capsys):
     other = simulate(1, image_shape=(64, 64), density=50, distortion=1, detector="other")
     write_simulation(other, tmp_path, images=())
     assert run(["evaluate", str(results / "out"), "--truth", str(tmp_path)]) == 2
-    assert "the truth has no frame sim-01" in capsys.readouterr().err
+    assert "the simulation has no frame sim-01" in capsys.readouterr().err
 
 
 def test_matches_alone(results, tmp_path, capsys):

@@ -166,7 +166,7 @@ def test_bad_places(tmp_path):
     with pytest.raises(OutputExistsError, match="file exists and is kept"):
         check_output(tmp_path / "a.txt", overwrite=False)
     check_output(tmp_path / "a.txt", overwrite=True)
-    with pytest.raises(InputError, match="must be a file, this is a folder"):
+    with pytest.raises(InputError, match="the output must be a file, is a folder"):
         check_output(tmp_path, overwrite=True)
     with pytest.raises(InputError, match="folder must exist, found no"):
         check_output(tmp_path / "no" / "a.txt", overwrite=False)

@@ -233,7 +233,7 @@ def test_fold_attitude_with_radial_terms():
         fold_attitude(pv, matrix)(*u), matrix @ np.array(pv(*np.linalg.solve(matrix, u)))
     )
     assert fold_attitude(pv, np.eye(2)) is pv
-    with pytest.raises(FileFormatError, match="radial terms can only be turned and scaled"):
+    with pytest.raises(FileFormatError, match="radial terms can only be rotated and scaled"):
         fold_attitude(pv, [[1.0, 0.1], [0.0, 1.0]])
 
 
@@ -294,7 +294,7 @@ class TestRefused:
         header = tpv_header()
         for key in list(header["CD*"]):
             del header[key]
-        with pytest.raises(FileFormatError, match="scale of the pixels in CD, PC"):
+        with pytest.raises(FileFormatError, match="pixel scale in CD, PC"):
             parse_tan(header)
         header["CDELT1"] = 1e-4
         with pytest.raises(FileFormatError, match="card CDELT2 is missing"):

@@ -661,7 +661,7 @@ def test_sources_leaves_out_what_is_not_a_clean_star():
     assert not np.isin(matches["source_index"] % 7, (0, 1, 2)).any()
     assert len(matches) > 0.45 * n
     sources["snr"] = 1.0
-    with pytest.raises(MatchError, match=f"none of {n} sources"):
+    with pytest.raises(MatchError, match=f"{n} of {n} sources left out"):
         match_sources(sources, catalog, wcs, image_shape=SHAPE)
 
 

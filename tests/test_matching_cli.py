@@ -80,7 +80,7 @@ def test_writes_pairs_and_evidence(match, sky, tmp_path, capsys):
     said = capsys.readouterr()
     assert f"{len(pairs)} pairs" in said.out
     assert "expected by chance" in said.out
-    assert "the first pixel was taken for 0 (--origin 1 if it is 1)" in said.err
+    assert "the first pixel was taken to be 0 (--origin 1 if it is 1)" in said.err
 
 
 def test_what_is_given_by_hand(match, tmp_path, capsys):

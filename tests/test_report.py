@@ -195,7 +195,7 @@ def test_detector_without_table_or_solution(rng):
     assert len(page.images) == 2
     assert ["method", "paper"] in [row for table in page.tables for row in table]
     text = written(summary, {}, matches)
-    assert "No solution of it is at hand." in text
+    assert "No solution is stored for it." in text
     assert len(Page(text).images) == 2
 
 

@@ -457,7 +457,7 @@ def test_a_run_that_was_killed_is_completed_by_the_next(
 
 def test_one_run_at_a_time(frames, inputs, tmp_path):
     pytest.importorskip("fcntl")
-    with ResultFolder(tmp_path), pytest.raises(InputError, match="another run is writing into"):
+    with ResultFolder(tmp_path), pytest.raises(InputError, match="another run is writing to"):
         calibrate(frames, inputs[1], output=tmp_path)
     calibrate(frames[:1], inputs[1], output=tmp_path)
 

@@ -352,7 +352,7 @@ def test_ldac(small, tmp_path):
 
 def test_files_are_kept(small, tmp_path):
     write_simulation(small, tmp_path, images=())
-    with pytest.raises(FileExistsError, match=r"sim-reference.fits exists"):
+    with pytest.raises(FileExistsError, match=r"sim-reference.fits: file exists"):
         write_simulation(small, tmp_path, images=())
     write_simulation(small, tmp_path, images=(), overwrite=True)
 

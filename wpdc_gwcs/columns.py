@@ -80,7 +80,7 @@ def listed(names, most=12):
 
 
 def read_text(column):
-    """Give a column of text without blanks around it.
+    """Return a column of text without blanks around it.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def read_text(column):
 
 
 def read_numbers(column, *, several=False):
-    """Give a column as plain floats.
+    """Return a column as plain floats.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def numbers_or_none(table, name, rows=slice(None)):
 
 
 def numbers_or_nan(table, name):
-    """Give a column as floats, NaN where the table does not have it.
+    """Return a column as floats, NaN where the table does not have it.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def numbers_or_nan(table, name):
 
 
 def unit_of(column, default=None):
-    """Give the unit of a column, also one that is not quite in the standard.
+    """Return the unit of a column, also one that is not quite in the standard.
 
     Parameters
     ----------

@@ -115,7 +115,7 @@ def fit_wcs(wcs, *, image_shape=None, detector="detector", frame="converted"):
 
 
 def _with_table(found, sky, calibration):
-    """Give a cubic the table of what it leaves, of as many nodes as it takes."""
+    """Return a cubic the table of what it leaves, of as many nodes as it takes."""
     pv, (ny, nx) = found.solution.pv, found.solution.image_shape
     crpix, cd = (np.asarray(v) for v in (found.solution.crpix, found.cd))
     best = None
@@ -186,7 +186,7 @@ def _reference(wcs, sky, shape):
 
 
 def _sky_function(wcs):
-    """Give a function of pixels that returns ICRS in deg."""
+    """Return a function of pixels that returns ICRS in deg."""
     if hasattr(wcs, "tran") and hasattr(wcs, "Nin"):
         return _sky_of_ast(wcs)
     if hasattr(wcs, "low_level_wcs"):

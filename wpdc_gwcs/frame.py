@@ -29,7 +29,7 @@ class Frame:
         Starting WCS with the shared low-level interface (``pixel_to_world_values``, zero based),
         for example `astropy.wcs.WCS`; world axes are ICRS, RA first.
     epoch : float, optional
-        Mid-exposure epoch in Julian years; `None` where the header has no date.
+        Mid-exposure epoch in Julian years; `None` if the header has no date.
     source : str
         Where it came from, for messages: path and extension.
     load_image : callable, optional

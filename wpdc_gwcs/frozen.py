@@ -53,7 +53,7 @@ class _FrozenParameter(Parameter):
 
 
 def freeze(value):
-    """Give a value that cannot be changed, with all that is in it.
+    """Return a value that cannot be changed, with all that is in it.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def freeze_models(owner, *names):
 
 
 def with_statistics(result, **entries):
-    """Give the same result with more statistics.
+    """Return the same result with more statistics.
 
     Parameters
     ----------

@@ -69,7 +69,7 @@ def select_sources(sources, *, image_shape=None, max_roundness=MAX_ROUNDNESS, mi
 
 
 def judge_sources(sources, *, image_shape=None, max_roundness=MAX_ROUNDNESS, min_snr=MIN_SNR):
-    """Tell which rule leaves out which sources.
+    """Return which rule leaves out which sources.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ def directions(ra, dec):
 
 
 def angles(vector):
-    """Give the position that a vector points at.
+    """Return the position that a vector points at.
 
     Parameters
     ----------

@@ -175,7 +175,7 @@ def shortcomings(frame, calibration, *, held, known=False, stored=None):
 
 
 def _few_detections(frame, match):
-    """Tell where few of all detections, or of the brightest clean ones, match."""
+    """Reasons if few of all detections, or of the brightest clean ones, match."""
     sources = frame.sources
     detected = int(on_detector(sources["x"], sources["y"], frame.image_shape).sum())
     if match.n_pairs < _MIN_DETECTED * min(detected, match.n_reference):

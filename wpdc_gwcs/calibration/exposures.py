@@ -31,7 +31,7 @@ def tie_exposures(frames):
     Returns
     -------
     list of Frame
-        The same frames, in order; some with another ``exposure``, or `None` where they are on their
+        The same frames, in order; some with another ``exposure``, or `None` if they are on their
         own.
 
     Warns

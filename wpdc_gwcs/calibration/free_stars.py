@@ -150,7 +150,7 @@ def _gather(exposures, moved, result):
 
 
 def _scales(pairs):
-    """Factors of the stated errors of centroids and catalog, `None` where too little tells."""
+    """Factors of the stated errors of centroids and catalog, `None` if too little tells."""
     weight = _inverse(pairs.centroid)
     n, total = pairs.sums(1.0), pairs.sums(weight)
     several = n >= 2

@@ -152,7 +152,7 @@ class Geometry:
         return at + _field_terms(self.plane, at) @ self.field + place
 
     def predict(self, frame):
-        """Predict where a frame is; `None` where nothing is known of its exposure.
+        """Predict where a frame is; `None` if nothing is known of its exposure.
 
         Parameters
         ----------

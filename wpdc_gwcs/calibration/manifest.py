@@ -84,7 +84,7 @@ class Manifest:
         return found
 
     def is_same(self, other, names):
-        """Tell whether some frames are solved together in two runs, and are the same frames.
+        """Return whether some frames are solved together in two runs, and are the same frames.
 
         Parameters
         ----------
@@ -109,7 +109,7 @@ class Manifest:
         )
 
     def groups(self):
-        """Tell which frames are solved together.
+        """Return which frames are solved together.
 
         Returns
         -------
@@ -194,7 +194,7 @@ class Manifest:
         return kind(reason)
 
     def is_done(self, name):
-        """Tell whether another try of a frame would give the same.
+        """Return whether another try of a frame would give the same.
 
         Parameters
         ----------

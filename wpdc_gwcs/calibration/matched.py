@@ -232,7 +232,7 @@ def _reach(frame, start, settings):
 
 
 def sky_of_frame(frame, settings, *, solution=None):
-    """Tell where on the sky the stars of a frame are, and those that others may need to find it.
+    """Return where on the sky the stars of a frame are, and those that others may need to find it.
 
     Parameters
     ----------

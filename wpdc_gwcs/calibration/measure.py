@@ -220,7 +220,7 @@ def _first_gain(frame, settings, background):
 
 
 def _contradicts(gain, noise):
-    """Tell whether the noise in the stars rules out a stated gain."""
+    """Return whether the noise in the stars rules out a stated gain."""
     if gain is None or noise.n_stars < _MIN_STARS:
         return False
     if noise.least_gain > _MAX_GAIN_RATIO * gain:

@@ -21,7 +21,7 @@ _STEP = 1e-4
 
 
 def sky_positions(calibration, x, y, x_err, y_err):
-    """Give the positions of sources on the sky, with their errors.
+    """Return the positions of sources on the sky, with their errors.
 
     Parameters
     ----------

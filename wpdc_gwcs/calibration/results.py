@@ -135,7 +135,7 @@ class ResultFolder:
             os.close(self._lock)
 
     def earlier_groups(self):
-        """Tell which frames the run that is to be resumed has solved together.
+        """Return which frames the run that is to be resumed has solved together.
 
         Returns
         -------
@@ -285,7 +285,7 @@ class ResultFolder:
         return others
 
     def is_done(self, group):
-        """Tell whether frames were done by the run that is resumed, and are left out.
+        """Return whether frames were done by the run that is resumed, and are left out.
 
         Parameters
         ----------
@@ -467,7 +467,7 @@ class ResultFolder:
 
 
 def _of_run(result, run):
-    """Give a result or table the identity of its run."""
+    """Return a result or table the identity of its run."""
     if isinstance(result, Table):
         marked = result.copy(copy_data=False)
         marked.meta["run"] = run

@@ -398,7 +398,7 @@ def _log_details(name, error, folder):
 
 
 def _joined(frames, outcomes, run_id, resumed):
-    """Give the result of a run from those of its groups."""
+    """Return the result of a run from those of its groups."""
     calibrations = {c.frame: c for outcome in outcomes for c in outcome.calibrations}
     rows = {row["frame"]: row for outcome in outcomes for row in outcome.rows}
     joined = {

@@ -53,7 +53,7 @@ def lock(folder):
     Returns
     -------
     int or None
-        File descriptor whose end is that of the lock, whatever ends the program; `None` where the
+        File descriptor whose end is that of the lock, whatever ends the program; `None` if the
         file system has no locks.
 
     Raises
@@ -95,7 +95,7 @@ def clean(folder):
 
 
 def put_in_place(done, folder):
-    """Give the files of a set their names, the WCS of a frame after its tables.
+    """Rename the files of a set to their final names, the WCS of a frame after its tables.
 
     Parameters
     ----------

@@ -77,7 +77,7 @@ class Run:
     progress: Callable
 
     def catalog_of(self, group):
-        """Give the reference stars of frames that are solved together.
+        """Return the reference stars of frames that are solved together.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Reference catalogs: read, check, move to the epoch of a frame, cut to the sky it covers.
+"""Reference catalogs: read, check, cut to the sky of a frame, move to its epoch.
 
 ::
 
@@ -6,11 +6,11 @@
                                                   --select_cone--> near the frame
                                                   --propagate--> at the epoch of the frame
 
-Motions are filled from the whole catalog, before the cut, so that a star moves alike in all
-frames.
+Missing motions are filled in from the whole catalog, before the cut, so that a star moves the same
+way in all frames.
 
-The checked table has plain float64 columns with fixed names and units, whatever the input called
-them:
+The checked table has plain float64 columns with fixed names and units, whatever their names and
+units in the input:
 
 ===================== ======== =================================================================
 column                unit     meaning

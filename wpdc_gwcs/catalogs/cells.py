@@ -1,4 +1,4 @@
-"""Cells of the sky: HEALPix in the nested scheme, by which large catalogs are divided."""
+"""HEALPix cells of the sky (nested scheme), into which large catalogs are divided."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from wpdc_gwcs.sky import directions
 
 __all__ = ["cells_in", "cells_of", "circles_of"]
 
-# Degrees that the corners of a cell may be off by rounding.
+# Rounding error of the corners of a cell, deg.
 _MARGIN = 1e-6
 
 
@@ -17,7 +17,7 @@ def _healpix(order):
 
 
 def cells_of(order, ra, dec):
-    """Tell the cells of positions.
+    """Return the cells that positions lie in.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def cells_of(order, ra, dec):
 
 
 def circles_of(order, cells):
-    """Give the circles around cells.
+    """Return the smallest circles around cells.
 
     Parameters
     ----------
@@ -51,20 +51,20 @@ def circles_of(order, cells):
     Returns
     -------
     ra, dec, radius : (N,) ndarray
-        Center and radius of the least circle about it that holds the cell, deg.
+        Center and radius of the smallest circle about the center that contains the cell, deg.
     """
     healpix, cells = _healpix(order), np.asarray(cells, int)
     ra, dec = (c.to_value("deg") for c in healpix.healpix_to_lonlat(cells))
-    # The rim is curved: its points, not its corners alone.
+    # The rim is curved, so points along it are needed, not only its corners.
     lon, lat = (c.to_value("deg") for c in healpix.boundaries_lonlat(cells, 8))
     rim = directions(lon, lat)[0]
     chord = np.linalg.norm(rim - directions(ra, dec)[0][..., None], axis=0).max(axis=-1)
-    # What the rim may stick out between its points is a hundredth of a cell at most.
+    # Between these points, the rim bulges by at most a hundredth of a cell.
     return ra, dec, np.degrees(2 * np.arcsin(np.minimum(chord / 2, 1))) * 1.01 + _MARGIN
 
 
 def cells_in(region, order, cells=None):
-    """Tell which cells a region touches.
+    """Return the cells that a region touches.
 
     Parameters
     ----------
@@ -73,12 +73,12 @@ def cells_in(region, order, cells=None):
     order : int
         The sky has 12 * 4**order cells.
     cells : (N,) array_like of int, optional
-        Cells that come into question; default all.
+        Candidate cells; all by default.
 
     Returns
     -------
     (M,) ndarray of int
-        Numbers of the cells; a few that are touched only nearly may be among them.
+        Numbers of the cells, perhaps with a few that the region only comes close to.
     """
     healpix = _healpix(order)
     cells = np.arange(healpix.npix) if cells is None else np.asarray(cells, int)

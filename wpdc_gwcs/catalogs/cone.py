@@ -1,4 +1,4 @@
-"""The part of a catalog about a place on the sky."""
+"""The part of a catalog near a position."""
 
 import numpy as np
 
@@ -15,12 +15,12 @@ def select_cone(catalog, ra, dec, radius):
     ra, dec : float
         Center, deg.
     radius : float
-        Radius, deg; the rim belongs to the cone.
+        Radius, deg; stars exactly on the edge are included.
 
     Returns
     -------
     catalog : `~astropy.table.Table`
-        The rows inside, in their order.
+        The rows inside, in their original order.
 
     Examples
     --------
@@ -36,7 +36,7 @@ def select_cone(catalog, ra, dec, radius):
             f"got ra={ra}, dec={dec}, radius={radius}"
         )
     all_dec = np.asarray(catalog["dec"], float)
-    # The band in declination leaves little for the trigonometry.
+    # A cut in declination leaves few stars for the trigonometry.
     near = np.flatnonzero(np.abs(all_dec - dec) <= radius)
     near_ra, near_dec = (
         np.radians(np.asarray(catalog["ra"], float)[near]),

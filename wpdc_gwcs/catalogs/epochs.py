@@ -1,4 +1,4 @@
-"""Reference epochs of catalogs: columns, metadata, the release that is named."""
+"""Reference epochs of catalogs, from columns, metadata or the name of a release."""
 
 import re
 import warnings
@@ -18,7 +18,7 @@ _GAIA_EPOCHS = (
     (re.compile(r"gaia\s*[-_/]?\s*dr1|I[/_]337", re.IGNORECASE), 2015.0),
 )
 _ASSUMED_EPOCH = 2016.0
-# Positions on photographic plates are older than any reference catalog of use.
+# No useful reference catalog is older than the first photographic plates.
 _EPOCH_RANGE = (1800.0, 2200.0)
 
 
@@ -32,16 +32,16 @@ def reference_epochs(table, spelled, position, name, *, has_motion):
     spelled : dict
         Names of its columns, see `wpdc_gwcs.columns.spelled_names`.
     position : str or None
-        Column whose description may tell.
+        Column whose description may contain the epoch.
     name : str
-        What messages call the input.
+        Name of the input in messages.
     has_motion : bool
         Whether an epoch is needed.
 
     Returns
     -------
     (N,) ndarray or None
-        Julian years; `None` where none is known and none is needed.
+        Julian years; `None` if none is known and none is needed.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def _julian_years(table, column, name):
     known = values[np.isfinite(values)]
     if known.size == 0:
         return None
-    # Julian dates and modified ones occur (Pan-STARRS); no catalog is from before the year 1000.
+    # (Modified) Julian dates occur (Pan-STARRS); no catalog is from before the year 1000.
     if known.min() > 2.3e6:
         values = 2000.0 + (values - 2451545.0) / 365.25
     elif known.min() > 10000.0:

@@ -8,14 +8,14 @@ __all__ = ["require"]
 
 
 def require(what, extra, *packages):
-    """Refuse to go on without the packages of an extra.
+    """Raise an error unless the packages of an extra are installed.
 
     Parameters
     ----------
     what : str
-        What was asked for.
+        What needs them, for the message.
     extra : str
-        Extra of this package that brings them.
+        Extra of this package that installs them.
     *packages : str
         Names of modules.
 

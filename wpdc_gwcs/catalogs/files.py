@@ -1,4 +1,4 @@
-"""Tables in files, whatever their format: what astropy reads, and what it stumbles over."""
+"""Table files of any format: those that astropy reads, and those that it stumbles over."""
 
 import bz2
 import csv
@@ -73,10 +73,10 @@ READ_ERRORS = (
     struct.error,
     zlib.error,
 )
-# Endings of tables that are no plain text: astropy finds out by itself.
+# Suffixes of tables that are not plain text: astropy identifies these itself.
 _FOREIGN = re.compile(r"\.(vot|votable|xml|h5|hdf5|html?|asdf|mrt|feather)$")
 _OPENERS = ((b"\x1f\x8b", gzip.open), (b"BZh", bz2.open), (b"\xfd7zXZ\x00", lzma.open))
-# Characters that no text has.
+# Characters that do not occur in text.
 _BINARY = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 _MARKS = (
     (b"\xef\xbb\xbf", "utf-8-sig"),
@@ -84,12 +84,12 @@ _MARKS = (
     (b"\xff\xfe", "utf-16"),
     (b"\xfe\xff", "utf-16"),
 )
-# What stands for no value whatever the column holds; other words may be names of something.
+# Words that mean "no value" in any column; other words may be names.
 _FILL = [(t, "0") for t in ("", "null", "NULL", "Null", "--", "---", "N/A", "n/a", "\\N")]
 
 
 def split_extension(path):
-    """Split ``path[EXT]``; a file whose name really ends in brackets is left alone.
+    """Split ``path[EXT]``; a file whose name really ends in brackets is kept.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def split_extension(path):
 
 
 def special_file(path):
-    """Tell what a path is that is no file: what waits for ever when it is read, or has no end.
+    """Tell what a path is if it is not a file: reading it might block for ever or never end.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def special_file(path):
     Returns
     -------
     what : str or None
-        For messages, such as ``a folder`` or ``a pipe``; `None` of a file, and of nothing.
+        For messages, such as ``a folder`` or ``a pipe``; `None` for a file or a missing path.
     """
     try:
         mode = os.stat(path).st_mode
@@ -139,7 +139,7 @@ def special_file(path):
 
 
 def is_fits(path):
-    """Tell whether a file is FITS, compressed as a whole or not.
+    """Return whether a file is FITS, compressed as a whole or not.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def is_fits(path):
     Returns
     -------
     bool
-        By its first bytes.
+        True if its first bytes are those of FITS.
     """
     with open_any(path) as file:
         return file.read(9) == b"SIMPLE  ="
@@ -163,9 +163,9 @@ def choose_table(hdus, path, extension=None):
     hdus : `~astropy.io.fits.HDUList`
         The file.
     path : path-like
-        What messages call it.
+        Name of the file in messages.
     extension : int or str, optional
-        The extension that was asked for; default: the first table that has positions.
+        The extension to use; by default the first table that has positions.
 
     Returns
     -------
@@ -185,7 +185,7 @@ def choose_table(hdus, path, extension=None):
     tables = [h for h in hdus if isinstance(h, kinds)]
     if not tables:
         raise CatalogError(f"{path}: must have a table extension, has none")
-    # LDAC files have a header table first, others whatever their writer liked.
+    # LDAC files begin with a header table; other files have tables in any order.
     tables.sort(key=lambda h: find_positions(spelled_names(h.columns.names)) is None)
     return tables[0]
 
@@ -199,19 +199,19 @@ def read_table_file(path, format=None):
         Text in any form that astropy knows (also compressed, with a byte-order mark, in latin-1),
         VOTable, HDF5, Parquet, HTML, ASDF.
     format : str, optional
-        Format name for `astropy.table.Table.read`; found by name and content without it.
+        Format name for `astropy.table.Table.read`; by default found from name and content.
 
     Returns
     -------
     `~astropy.table.Table`
-        The table; values that stand for none (``null``, ``--``) are masked.
+        The table; words that mean "no value" (``null``, ``--``) are masked.
 
     Raises
     ------
     one of READ_ERRORS
         If the file cannot be read.
     """
-    # Absolute, since a leading '~' is not a name to astropy.
+    # Absolute, because astropy expands a leading '~'.
     path = Path(path).absolute()
     text_format = format is not None and format.startswith("ascii")
     if format is not None and not text_format:
@@ -254,7 +254,7 @@ def read_lines(path):
     Raises
     ------
     one of READ_ERRORS
-        If the file cannot be read or is no text.
+        If the file cannot be read or is not text.
     """
     with open_any(path) as file:
         return decode(file.read()).splitlines()
@@ -271,7 +271,7 @@ def open_any(path):
     Returns
     -------
     file object
-        Of what is in it.
+        Yields the decompressed bytes.
     """
     with open(path, "rb") as file:
         start = file.read(6)
@@ -279,7 +279,7 @@ def open_any(path):
 
 
 def plain_name(path):
-    """Name of a file in lower case, without what compression adds to it.
+    """Return the name of a file in lower case, without the suffix of its compression.
 
     Parameters
     ----------
@@ -289,13 +289,13 @@ def plain_name(path):
     Returns
     -------
     str
-        Such as ``gaia.csv`` of ``Gaia.csv.gz``.
+        For example ``gaia.csv`` for ``Gaia.csv.gz``.
     """
     return re.sub(r"\.(gz|bz2|xz)$", "", path.name.lower())
 
 
 def decode(content):
-    """Make text of bytes.
+    """Decode bytes to text.
 
     Parameters
     ----------
@@ -310,7 +310,7 @@ def decode(content):
     Raises
     ------
     ValueError
-        If it is no text.
+        If the bytes are not text.
     """
     encoding = next((e for mark, e in _MARKS if content.startswith(mark)), "utf-8")
     if encoding.startswith("utf-8") and _BINARY.search(content):
@@ -322,21 +322,21 @@ def decode(content):
 
 
 def csv_form(head, first):
-    """Tell the delimiter of CSV and its line of names, which may stand in a comment.
+    """Find the delimiter of CSV and its line of column names, which may be a comment.
 
     Parameters
     ----------
     head : list of str
-        Lines of comments before it.
+        Comment lines before it.
     first : str
-        First line that is no comment.
+        First line that is not a comment.
 
     Returns
     -------
     delimiter : str
-        One of ``,;|`` and the tabulator.
+        One of ``,;|`` and the tab.
     names : str
-        The first line itself, unless a comment has the names.
+        Line with the column names: the first line, unless a comment has them.
     """
     delimiter = max(",;\t|", key=first.count)
     if head and head[-1].count(delimiter) == first.count(delimiter) > 0:
@@ -357,7 +357,7 @@ def parse_csv(lines, delimiter):
     lines : list of str
         Names and rows.
     delimiter : str
-        What stands between cells.
+        Separator of the cells.
 
     Returns
     -------
@@ -368,7 +368,7 @@ def parse_csv(lines, delimiter):
 
 
 def _read_csv(lines):
-    """Read CSV with any delimiter, comments before it, and names that may stand in a comment."""
+    """Read CSV with any delimiter and leading comments, one of which may have the names."""
     comments = next((k for k, line in enumerate(lines) if not line.startswith("#")), 0)
     head, rows = lines[:comments], [line for line in lines[comments:] if line.strip()]
     delimiter, names = csv_form(head, rows[0])
@@ -376,7 +376,7 @@ def _read_csv(lines):
 
 
 def parse_ecsv(lines):
-    """Parse ECSV; where a cell is not what the header says, as text with the header's units.
+    """Parse ECSV; if a cell contradicts the header, read the cells as text, with its units.
 
     Parameters
     ----------

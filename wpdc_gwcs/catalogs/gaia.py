@@ -1,4 +1,4 @@
-"""Gaia's archive: the stars of a region, asked for cell by cell and kept on disk.
+"""The Gaia archive: the stars of a region, queried cell by cell and cached on disk.
 
 ::
 
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 _ESA = "https://gea.esac.esa.int/tap-server/tap"
 _TABLE = "gaiadr3.gaia_source"
-# What a calibration looks at: 22 of 152 columns.
+# Columns that a calibration uses: 22 of 152.
 _COLUMNS = (
     *("source_id", "ref_epoch", "ra", "dec", "pmra", "pmdec", "parallax", "radial_velocity"),
     *("ra_error", "dec_error", "pmra_error", "pmdec_error", "parallax_error", "ruwe"),
@@ -38,23 +38,23 @@ _COLUMNS = (
     *("dec_pmra_corr", "dec_pmdec_corr", "pmra_pmdec_corr"),
     *("phot_g_mean_mag", "bp_rp"),
 )
-# Fainter ones have motions uncertain by 1 mas / yr and more: of no use some years later.
+# Fainter stars have proper motion errors of 1 mas / yr and more: useless some years later.
 _FAINTEST = 20.5
-# Cells of 0.8 square degrees: one to four for a frame, and a million stars where the sky is full.
+# Cells of 0.8 square degrees: one to four per frame, and up to a million stars in dense fields.
 _ORDER = 6
-# Services that do not say how many rows they give may stop at 2000.
+# Without an explicit limit, some services stop at 2000 rows.
 _MOST_ROWS = 5_000_000
-# s before each try
+# s to wait before each try
 _WAITS = (0.0, 2.0, 10.0)
-# s to connect, and until an answer comes; a query may stand in a queue
+# s to connect, and s to wait for an answer: queries may be queued
 _TIMEOUTS = (15.0, 300.0)
-# Answers of services that have no jobs, but give results at once.
+# HTTP status of services without asynchronous jobs, which return results at once.
 _NO_JOBS = (404, 405, 501)
 
 
 @dataclass(frozen=True)
 class GaiaArchive:
-    """Gaia DR3 in an archive that answers queries (TAP); what came once is kept on disk.
+    """Gaia DR3 in an archive with a TAP service; answers are cached on disk.
 
     Parameters
     ----------
@@ -62,10 +62,10 @@ class GaiaArchive:
         Address of the service; default: ``WPDC_GWCS_TAP_URL`` of the environment, else that of the
         Gaia archive at ESA.
     cache : path-like, optional
-        Folder of what came; default: ``WPDC_GWCS_CACHE`` of the environment, else the cache folder
-        that astropy would use for this package.
+        Cache folder; default: ``WPDC_GWCS_CACHE`` of the environment, else the cache folder that
+        astropy would use for this package.
     max_mag : float, optional
-        G magnitude of the faintest stars asked for.
+        G magnitude of the faintest stars to request.
     table : str, optional
         Table of the service, with the columns of ``gaia_source``.
 
@@ -100,7 +100,7 @@ class GaiaArchive:
 
     @property
     def identity(self):
-        """What it is that is asked, the same for all regions."""
+        """Name of the service and its limits, the same for all regions."""
         return str(self)
 
     def stars_of(self, region):
@@ -114,13 +114,13 @@ class GaiaArchive:
         Returns
         -------
         `~astropy.table.Table`
-            Columns as in the archive; stars of no other part of the sky.
+            Columns as in the archive; only stars of this region.
 
         Raises
         ------
         CatalogError
-            If the archive does not answer, refuses, or would not give all; the message tells what
-            to do.
+            If the archive does not answer, refuses the query or returns only a part of the stars;
+            the message says what to do.
         """
         require("--catalog gaia", "gaia", "pyvo", "astropy_healpix")
         cells = cells_in(region, _ORDER)
@@ -154,12 +154,12 @@ class GaiaArchive:
             except OSError as problem:
                 root = tempfile.gettempdir()
                 log.warning("no cache folder (%s): %s is used", problem, root)
-        # Services differ in what they have, and a stand-in of theirs is none of them.
+        # Each service has its own cache: their contents differ.
         service = hashlib.sha256(f"{self.url} {self.table}".encode()).hexdigest()[:8]
         return Path(root) / "gaia" / f"{self.table.replace(chr(34), '')}-{service}"
 
     def _kept(self, folder, cell):
-        """Table of a cell from disk, or None: one of fainter stars has the brighter ones."""
+        """Table of a cell from disk, or None; a deeper cached table will do."""
         kept = {}
         for path in folder.glob(f"Npix={cell}-G*.fits"):
             with contextlib.suppress(ValueError):
@@ -221,7 +221,7 @@ def _answer(url, query):
     import pyvo
 
     with warnings.catch_warnings():
-        # Of VOTables that are not quite in the standard; that rows are missing is an error.
+        # VOTables that deviate slightly from the standard are fine; missing rows are an error.
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", pyvo.dal.DALOverflowWarning)
         with _session() as session:
@@ -247,7 +247,7 @@ def _session():
 
 
 def _keep(table, path):
-    """Write a cell into the cache, whole or not at all; a cache that cannot be used is no error."""
+    """Write a cell to the cache atomically; an unusable cache is not an error."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(".tmp", dir=path.parent)

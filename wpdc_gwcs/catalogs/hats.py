@@ -1,4 +1,4 @@
-"""HATS: catalogs that are divided by HEALPix cells into Parquet files."""
+"""HATS: catalogs partitioned into Parquet files by HEALPix cell."""
 
 import hashlib
 import re
@@ -17,18 +17,18 @@ from wpdc_gwcs.exceptions import CatalogError
 __all__ = ["HatsCatalog"]
 
 _PARTITION = re.compile(r"Norder=(\d{1,2})/(?:Dir=\d+/)?Npix=(\d+)(?:\.parquet|/[^/]+\.parquet)$")
-# Names of the file in which a catalog says what it is, the newest first.
+# Names of the properties file of a catalog, newest convention first.
 _ABOUT = ("hats.properties", "properties", "catalog_info.json")
 
 
 @dataclass(frozen=True)
 class HatsCatalog:
-    """A catalog in HATS, of which only the partitions are read that are needed.
+    """A HATS catalog, of which only the needed partitions are read.
 
     Parameters
     ----------
     path : path-like
-        Folder of the catalog, or of a collection that has it; on a disk.
+        Local folder of the catalog, or of a collection that contains it.
 
     Raises
     ------
@@ -54,7 +54,7 @@ class HatsCatalog:
 
     @cached_property
     def root(self):
-        """Folder of the catalog itself, which may be one of a collection."""
+        """Folder of the catalog itself, which may be part of a collection."""
         folder = Path(self.path)
         collection = folder / "collection.properties"
         if not collection.is_file():
@@ -66,7 +66,7 @@ class HatsCatalog:
 
     @cached_property
     def partitions(self):
-        """Order and number of each partition, and its files."""
+        """Files of each partition by its order and number."""
         found = {}
         for path in sorted(self.root.rglob("*.parquet")):
             name = path.relative_to(self.root).as_posix()
@@ -79,7 +79,7 @@ class HatsCatalog:
 
     @property
     def identity(self):
-        """What it is, the same for all regions."""
+        """Name of the catalog, the same for all regions."""
         digest = hashlib.sha256()
         for paths in self.partitions.values():
             for path in paths:
@@ -89,7 +89,7 @@ class HatsCatalog:
         return f"{self} {digest.hexdigest()}"
 
     def files_of(self, region):
-        """Tell which files have stars of a region.
+        """Return the files that may have stars of a region.
 
         Parameters
         ----------
@@ -99,7 +99,7 @@ class HatsCatalog:
         Returns
         -------
         list of `~pathlib.Path`
-            The files of those partitions that it touches.
+            The files of the partitions that the region touches.
         """
         require(str(self), "hats", "astropy_healpix")
         files = []
@@ -120,7 +120,7 @@ class HatsCatalog:
         Returns
         -------
         `~astropy.table.Table`
-            Columns of the catalog that are known here.
+            The columns of the catalog that `read_catalog` knows.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Positions at another epoch: proper motion, parallax, and what their errors add."""
+"""Positions at another epoch: proper motion, parallax, and the growth of errors."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,29 +10,29 @@ from wpdc_gwcs.sky import annual_parallax, directions, move, radial_motion
 
 __all__ = ["fill_motions", "propagate"]
 
-# Stars whose median stands in for a motion that is not known.  Fewer than the least say nothing
-# about their scatter, hence nothing about the error of a star that is moved by them.
+# Number of neighbors whose median replaces an unknown motion.  Fewer than the minimum do not tell
+# their scatter, and so not the error of a star that is moved by them.
 _NEIGHBORS = 30
 _LEAST_NEIGHBORS = 5
-# Stars whose neighbors are looked up at once: some 30 MB.
+# Number of stars whose neighbors are looked up at once: about 30 MB.
 _BLOCK = 20000
 
 
 def fill_motions(catalog):
-    r"""Give stars without a known proper motion that of their neighbors.
+    r"""Fill in unknown proper motions from neighboring stars.
 
     Parameters
     ----------
     catalog : `~astropy.table.Table`
-        As returned by `read_catalog`; all of it, because a part has other neighbors.
+        As returned by `read_catalog`; the whole catalog, because a part has other neighbors.
 
     Returns
     -------
     catalog : `~astropy.table.Table`
         A copy with ``pmra``, ``pmdec``, ``pmra_error`` and ``pmdec_error`` filled in where the
         motion was not known, and the boolean column ``pm_from_neighbors``.  The catalog itself
-        where there is nothing to fill, where it has been filled, or where fewer than five stars
-        have a motion.
+        if there is nothing to fill, if it has been filled before, or if fewer than five stars have
+        a motion.
 
     Notes
     -----
@@ -76,7 +76,7 @@ def fill_motions(catalog):
     for k, name in enumerate(("pmra", "pmdec")):
         for column, new in ((name, median[k]), (f"{name}_error", error[k])):
             values = numbers_or_nan(catalog, column)
-            # One of the two may be known, and stays.
+            # One of the two may be known and is kept.
             values[unknown[k]] = new[unknown[k, lacking]]
             filled[column] = unit_column(column, values)
     filled["pm_from_neighbors"] = lacking
@@ -89,7 +89,7 @@ def propagate(catalog, epoch, *, parallax=False):
     Parameters
     ----------
     catalog : `~astropy.table.Table`
-        As returned by `read_catalog`; a part of it better after `fill_motions`.
+        As returned by `read_catalog`; call `fill_motions` before you select a part of it.
     epoch : float or `~astropy.time.Time`
         Julian year (TCB and TDB need not be told apart here).
     parallax : bool, optional
@@ -106,7 +106,7 @@ def propagate(catalog, epoch, *, parallax=False):
 
     Notes
     -----
-    Linear motion in space on unit vectors (The Hipparcos and Tycho Catalogs, ESA SP-1200, vol. 1,
+    Linear motion in space on unit vectors (The Hipparcos and Tycho Catalogues, ESA SP-1200, vol. 1,
     sect. 1.5.5):
 
     .. math::
@@ -126,14 +126,15 @@ def propagate(catalog, epoch, *, parallax=False):
     catalog has only those of the motions.  The covariance of the two axes grows likewise, with all
     four correlations of positions and motions that Gaia gives.
 
-    Of a parallax :math:`\varpi` with the error :math:`\sigma_\varpi` is used
+    For a parallax :math:`\varpi` with the error :math:`\sigma_\varpi`, the value
 
     .. math::
         \varpi \left(1 - \sigma_\varpi^2 / \varpi^2\right) \quad
         \text{where } \varpi > \sigma_\varpi, \quad 0 \text{ elsewhere,}
 
-    because most faint stars are farther than their parallaxes can tell, and a negative one is all
-    noise.  Without an error, the parallax is used as it is.  The column keeps what was given.
+    is used, because most faint stars are too far away for a measurable parallax, and a negative
+    parallax is pure noise.  Without an error, the parallax is used as it is.  The column itself is
+    not changed.
 
     Examples
     --------
@@ -178,9 +179,9 @@ def propagate(catalog, epoch, *, parallax=False):
 
 
 def _motion_of_neighbors(catalog, motion, known, rows):
-    """Median motion of the known stars nearest to each of some stars, and its error, (2, rows)."""
+    """Median motion of the nearest stars with a motion, and its error, each (2, rows)."""
     r, east, north = directions(np.asarray(catalog["ra"], float), np.asarray(catalog["dec"], float))
-    # In space, because East is not the same direction everywhere.
+    # As vectors in space, because East is not the same direction everywhere.
     vectors = (motion[0, known] * east[:, known] + motion[1, known] * north[:, known]).T
     tree = cKDTree(r[:, known].T)
     n = min(_NEIGHBORS, len(vectors))
@@ -198,8 +199,8 @@ def _motion_of_neighbors(catalog, motion, known, rows):
 def _grown_errors(catalog, axis, years):
     """Error of the position on one axis and its correlation with the motion, `years` later.
 
-    What is unknown counts as zero, so that an unknown error of the position does not hide what the
-    motion adds to it; the sum is NaN where nothing is known.
+    Unknown errors count as zero, so that an unknown position error does not hide what the motion
+    adds to it; the sum is NaN where nothing is known.
     """
     error, motion_error, correlation = f"{axis}_error", f"pm{axis}_error", f"{axis}_pm{axis}_corr"
     if motion_error not in catalog.colnames:
@@ -208,10 +209,10 @@ def _grown_errors(catalog, axis, years):
     position, motion = np.nan_to_num(given), np.nan_to_num(numbers_or_nan(catalog, motion_error))
     rho = np.clip(np.nan_to_num(numbers_or_nan(catalog, correlation)), -1.0, 1.0)
     growth = motion * years
-    # Rounding must not make it negative where rho is -1.
+    # Rounding must not make it negative if rho is -1.
     variance = np.maximum(position**2 + 2 * rho * position * growth + growth**2, 0.0)
     later = np.where(np.isnan(given) & (growth == 0), np.nan, np.sqrt(variance))
-    # The position has taken up the error of the motion: moving back gives the first error again.
+    # The correlation changes too: moving back restores the original error.
     product = np.nan_to_num(later) * motion
     with np.errstate(invalid="ignore", divide="ignore"):
         rho = np.where(product > 0, (rho * position * motion + motion * growth) / product, rho)
@@ -219,7 +220,7 @@ def _grown_errors(catalog, axis, years):
 
 
 def _grown_correlations(catalog, moved, years):
-    """Correlations of the two axes `years` later, of a catalog whose errors have grown already."""
+    """Correlations of the two axes `years` later, for a catalog whose errors have been grown."""
 
     def covariance(a, b):
         names = f"{a}_{b}_corr", f"{a}_error", f"{b}_error"
@@ -252,11 +253,11 @@ def _radial_motion(catalog):
 
 
 def _measured_parallax(catalog):
-    """Parallax less what may be its noise.
+    """Parallax shrunk by its expected noise.
 
-    Stars at exp(-p / 0.4 mas) with errors of 0.05 to 1 mas, log-uniform: it leaves 0.29 mas rms,
-    the parallaxes as they are 0.41, those above three errors alone 0.36, none at all 0.56.  With
-    errors of 0.5 to 1 mas: 0.51, 0.76, 0.55 and 0.56.
+    For parallaxes distributed as exp(-p / 0.4 mas) with errors of 0.05 to 1 mas (log-uniform), the
+    error that remains is 0.29 mas rms; with the raw parallaxes it is 0.41, with only those above
+    three errors 0.36, with none at all 0.56.  With errors of 0.5 to 1 mas: 0.51, 0.76, 0.55, 0.56.
     """
     parallax = np.array(catalog["parallax"], float)
     error = np.nan_to_num(numbers_or_nan(catalog, "parallax_error"))

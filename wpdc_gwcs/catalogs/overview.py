@@ -1,4 +1,4 @@
-"""What a catalog has: how much of the sky, how many stars of each magnitude, how good they are."""
+"""Overview of a catalog: area on the sky, number of stars per magnitude, quality."""
 
 import numpy as np
 from astropy import units as u
@@ -10,9 +10,9 @@ from wpdc_gwcs.sky import angles, directions
 
 __all__ = ["count_by_magnitude", "distrusted", "sky_area"]
 
-# Stars that a cell of the sky should have on average, so that none within is empty by chance.
+# Mean number of stars per cell, enough that no cell inside the area is empty by chance.
 _STARS_PER_CELL = 8
-# A thousand cells along a side tell enough.
+# A thousand cells along a side are fine enough.
 _FINEST = 10
 
 
@@ -27,12 +27,12 @@ def sky_area(catalog):
     Returns
     -------
     float
-        Square degrees, to some percent where there are a thousand stars; 0 without stars.
+        Square degrees, accurate to a few percent for a thousand stars; 0 without stars.
 
     Notes
     -----
-    Square cells of an equal-area projection are counted that have stars; those at the rim are half
-    full.
+    Counts the square cells of an equal-area projection that have stars; cells at the edge count
+    half.
     """
     if len(catalog) == 0:
         return 0.0
@@ -40,15 +40,15 @@ def sky_area(catalog):
     center = outward.mean(axis=1)
     center = center / max(np.linalg.norm(center), 1e-9)
     _, east, north = (v[:, 0] for v in directions(*angles(center[:, None])))
-    # Lambert's azimuthal projection: a square degree is one everywhere.
+    # Lambert's azimuthal projection, which preserves areas.
     factor = np.sqrt(2 / np.maximum(1 + center @ outward, 1e-12))
     x, y = east @ outward * factor, north @ outward * factor
-    # Askew: the borders of a box must not be those of the cells.
+    # Rotated, so that the edges of a box do not coincide with those of cells.
     x, y = 0.8 * x + 0.6 * y, 0.8 * y - 0.6 * x
     side = max(np.ptp(x), np.ptp(y), 1e-12)
     area = side**2
     for n in 2 ** np.arange(1, _FINEST + 1):
-        # A rim of empty cells all around.
+        # A border of empty cells all around.
         seen = np.zeros((n + 3, n + 3), bool)
         seen[tuple(1 + ((v - v.min()) / side * n).astype(int) for v in (x, y))] = True
         if len(x) < _STARS_PER_CELL * seen.sum():
@@ -58,7 +58,7 @@ def sky_area(catalog):
 
 
 def count_by_magnitude(catalog):
-    """Count stars magnitude by magnitude.
+    """Count stars by magnitude.
 
     Parameters
     ----------
@@ -68,8 +68,8 @@ def count_by_magnitude(catalog):
     Returns
     -------
     `~astropy.table.QTable`
-        ``mag_from`` and ``mag_to``, ``n``, ``density`` (per square degree of what the catalog
-        covers), ``with_motion`` (share) and ``position_error`` (median, mas, NaN where unknown).
+        ``mag_from`` and ``mag_to``, ``n``, ``density`` (per square degree of the catalog's
+        area), ``with_motion`` (fraction) and ``position_error`` (median, mas, NaN where unknown).
     """
     mag = numbers_or_nan(catalog, "phot_g_mean_mag")
     motion = np.isfinite(numbers_or_nan(catalog, "pmra") * numbers_or_nan(catalog, "pmdec"))
@@ -100,15 +100,15 @@ def distrusted(catalog, *, max_ruwe=None, max_error=None):
     catalog : `~astropy.table.Table`
         As returned by `read_catalog`.
     max_ruwe : float, optional
-        Greatest RUWE; above 1.4, the motion is not that of a single star.
+        Largest accepted RUWE; above 1.4, a single-star solution is doubtful.
     max_error : float, optional
-        Greatest error of the position on either axis, mas, at the epoch of the catalog.
+        Largest accepted position error along either axis, mas, at the epoch of the catalog.
 
     Returns
     -------
     dict
-        Name of each rule that was asked for to the mask of the stars that break it; a value that
-        is not known breaks none.
+        Mask of the stars that break a rule, by the name of the rule; an unknown value breaks no
+        rule.
     """
     broken = {}
     if max_ruwe is not None:

@@ -1,4 +1,4 @@
-"""Parquet: tables of columns, read by pyarrow without more."""
+"""Parquet tables, read with pyarrow alone."""
 
 from functools import partial
 
@@ -12,16 +12,16 @@ __all__ = ["LazyColumns", "parquet_groups", "read_parquet", "write_parquet"]
 
 
 class LazyColumns:
-    """Columns that are read when they are looked at.
+    """Columns that are read on first access.
 
     Parameters
     ----------
     names : list of str
         Their names.
     read : callable
-        Gives the column of a name.
+        Returns the column with a given name.
     meta : dict
-        What is said of all of them.
+        Metadata of the table.
     """
 
     def __init__(self, names, read, meta):
@@ -34,7 +34,7 @@ class LazyColumns:
 
 
 def read_parquet(path):
-    """Read a file.
+    """Read a Parquet file.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def read_parquet(path):
     Returns
     -------
     `~astropy.table.Table`
-        All its columns; units where astropy wrote them.
+        All columns, with units if astropy wrote the file.
 
     Raises
     ------
@@ -59,12 +59,12 @@ def read_parquet(path):
 
 
 def write_parquet(table, path):
-    """Write a table, with its units as astropy would write them.
+    """Write a table, with units as astropy writes them.
 
     Parameters
     ----------
     table : `~astropy.table.Table`
-        Plain columns.
+        Table of plain columns.
     path : path-like
         File to write.
     """
@@ -81,21 +81,21 @@ def write_parquet(table, path):
 
 
 def parquet_groups(paths, known):
-    """Give the row groups of Parquet files.
+    """Yield the row groups of Parquet files.
 
     Parameters
     ----------
     paths : iterable of `~pathlib.Path`
-        The files, one after the other.
+        The files, in this order.
     known : set of str
-        Names of columns, in lower case, that may be wanted.
+        Names of the columns that may be needed, in lower case.
 
     Yields
     ------
     positions : LazyColumns
-        Its numbers, read when they are looked at.
+        Numeric columns, read on first access.
     take : callable
-        Gives the table of those rows that a mask marks.
+        Returns the table of the rows that a mask selects.
     """
     from pyarrow import parquet
 
@@ -112,7 +112,7 @@ def parquet_groups(paths, known):
 
 
 def _parquet_rows(file, group, about, names, mask=None):
-    """Columns of a row group, one after the other: all of it decoded would be large."""
+    """Columns of a row group, one by one: decoded all at once, they would be large."""
     import pyarrow
 
     keep = None if mask is None else pyarrow.array(mask)
@@ -124,7 +124,7 @@ def _parquet_rows(file, group, about, names, mask=None):
 
 
 def _arrow_table(arrow, about):
-    """Table of astropy, with the units that astropy has written into a file."""
+    """Astropy table, with the units that astropy has stored in the file."""
     table = Table(meta=about.get("meta") or {})
     units = {column["name"]: column.get("unit") for column in about.get("datatype", ())}
     for name in arrow.column_names:

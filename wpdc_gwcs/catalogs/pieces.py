@@ -1,10 +1,10 @@
-"""Large files of stars: the rows of a region, read piece by piece.
+"""Large catalog files: the rows of a region, read piece by piece.
 
 ::
 
-    file --> pieces: positions first, the other columns of the rows that are wanted --> one table
+    file --> pieces: positions first, then the other columns of the selected rows --> one table
 
-What a file needs in memory is one piece and the rows that are wanted, not the file.
+Only one piece and the selected rows are in memory, never the whole file.
 """
 
 import re
@@ -30,11 +30,11 @@ from wpdc_gwcs.catalogs.positions import plain_degrees
 
 __all__ = ["Part", "parquet_pieces", "part_of", "pieces_of"]
 
-# Smaller files, bytes, are read whole: that costs no memory to speak of, and nothing is cut.
+# Smaller files (bytes) are read whole: they need little memory.
 _LARGE = 2**25
-# Rows that are looked at together.
+# Rows per piece.
 _PIECE = 50_000
-# Share of rows with impossible positions from which on the column is wrong, not the rows.
+# Above this fraction of impossible positions, the column is wrong, not the rows.
 _MOST_WRONG = 0.5
 
 
@@ -45,9 +45,9 @@ class Piece:
     Parameters
     ----------
     positions : `~astropy.table.Table`
-        The rows, with the columns of their positions at least.
+        The rows, with at least the columns of their positions.
     take : callable
-        Gives the table of those rows that a mask marks.
+        Returns the table of the rows that a mask selects.
     """
 
     positions: Table
@@ -61,11 +61,11 @@ class Part:
     Parameters
     ----------
     table : `~astropy.table.Table`
-        They, with all columns.
+        The rows, with all columns.
     rows : (N,) ndarray of int
-        Where they are in the file.
+        Their row numbers in the file.
     n_rows, n_wrong : int
-        How many rows the file has, and how many of them are off the sky.
+        Number of rows in the file, and of those with impossible positions.
     """
 
     table: Table
@@ -75,21 +75,21 @@ class Part:
 
 
 def pieces_of(path, extension, known):
-    """Give the pieces of a file.
+    """Return the pieces of a file.
 
     Parameters
     ----------
     path : `~pathlib.Path`
         The file.
     extension : int, str or None
-        Of a FITS file.
+        Extension of a FITS file.
     known : set of str
         Names of columns, in lower case, that may be wanted.
 
     Returns
     -------
     iterator of Piece or None
-        `None` where the file is small, or of a kind that has to be read whole.
+        `None` if the file is small, or its format has to be read whole.
     """
     if path.stat().st_size < _LARGE:
         return None
@@ -112,17 +112,17 @@ def part_of(pieces, region, *, sure=False):
     Parameters
     ----------
     pieces : iterable of Piece
-        As `pieces_of` gives them.
+        As returned by `pieces_of`.
     region : Region
-        What is wanted.
+        Part of the sky to select.
     sure : bool, optional
         Whether positions without a unit are known to be degrees.
 
     Returns
     -------
     Part or None
-        `None` where the positions cannot be told from a piece alone: text, what may be radians,
-        another equinox, or no positions at all.
+        `None` if one piece does not tell what the positions are: text, possible radians, another
+        equinox, or no positions at all.
     """
     taken, rows, total, wrong = [], [], 0, 0
     told = sure
@@ -150,7 +150,7 @@ def part_of(pieces, region, *, sure=False):
 
 
 def _stacked(tables):
-    """One table of many; a column that is text in one of them is text."""
+    """Stack tables; a column that is text in one of them becomes text."""
     for name in tables[0].colnames:
         kinds = {t[name].dtype.kind for t in tables if name in t.colnames}
         if kinds & set("USO") and kinds - set("USO"):
@@ -162,7 +162,7 @@ def _stacked(tables):
 
 
 def parquet_pieces(paths, known):
-    """Give the pieces of Parquet files.
+    """Return the pieces of Parquet files.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def _rows_of_fits(path, header, start):
     with open(path, "rb") as file:
         file.seek(start)
         for first in range(0, n_rows, _PIECE):
-            # Read, not mapped: pages of the file would count as memory of ours.
+            # Read, not memory-mapped: mapped pages would count as memory of this process.
             header["NAXIS2"] = min(_PIECE, n_rows - first)
             block = file.read(width * header["NAXIS2"])
             if len(block) < width * header["NAXIS2"]:
@@ -230,7 +230,7 @@ def _rows_of_text(path):
         while block := list(islice(file, _PIECE)):
             text = b"".join(block)
             if text.count(b'"') % 2:
-                # A field goes on in the next line, perhaps that of another piece.
+                # A quoted field continues on the next line, perhaps in the next piece.
                 yield Piece(Table(), None)
                 return
             rows = pending + [line for line in decode(text).splitlines() if line.strip()]

@@ -1,4 +1,4 @@
-"""Positions of a catalog: columns, units, impossible rows, old reference systems."""
+"""Positions of a catalog: columns, units, impossible values, old reference systems."""
 
 import logging
 import re
@@ -16,7 +16,7 @@ __all__ = ["POSITION_NAMES", "find_positions", "plain_degrees", "read_positions"
 
 log = logging.getLogger(__name__)
 
-# Pairs of position columns, best first; compared without regard to case.
+# Pairs of position columns, best first; case is ignored.
 _POSITIONS = (
     ("ra", "dec"),
     ("ra_icrs", "de_icrs"),
@@ -40,24 +40,24 @@ _POSITIONS = (
     ("alpha", "delta"),
 )
 POSITION_NAMES = {name for pair in _POSITIONS for name in pair}
-# Columns that are radians where they have no unit: the tables of the Rubin pipelines.
+# Columns that are in radians if they have no unit: tables of the Rubin pipelines.
 _RADIANS = ("coord_ra",)
-# Stars per square degree that no catalog has: taken for degrees, these positions are in another
-# unit.  The lower one decides where the name of the column speaks for radians already.
+# Densities in stars per square degree that no catalog reaches: such positions are not in degrees.
+# The lower limit is for columns whose name suggests radians.
 _TOO_DENSE, _DENSE = 1e7, 1e5
-# Rows without which a density says nothing.
+# Minimum number of rows for a meaningful density.
 _CROWD = 50
-# Share of rows with impossible positions from which on it is the column that is wrong.
+# Above this fraction of impossible positions, the column as a whole is wrong.
 _MOST_WRONG = 0.5
-# Single precision keeps so many bits of a position: of 360 deg, 0.05 arcsec.
+# Relative resolution of single precision: 0.05 arcsec at 360 deg.
 _SINGLE = np.finfo(np.float32).eps
-# Reference systems that differ from ICRS by more than 0.02 arcsec, by what metadata call them.
+# Reference systems that differ from ICRS by more than 0.02 arcsec, by their names in metadata.
 _OLD_SYSTEMS = {"FK4": "fk4", "B1950": "fk4", "FK4-NO-E": "fk4noeterms"}
 _SEXAGESIMAL = re.compile(r"[-+]?\d{1,3}[: hd]\s*[0-5]?\d[: m'](\s*[0-5]?\d(\.\d*)?[s\"]?)?")
 
 
 def find_positions(spelled):
-    """Find the columns of positions.
+    """Find the position columns.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def find_positions(spelled):
 
 
 def read_positions(table, pair, name):
-    """Read positions, and tell which rows have one.
+    """Read positions and find the rows that have one.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def read_positions(table, pair, name):
     pair : (str, str)
         Columns of right ascension and declination.
     name : str
-        What messages call the input.
+        Name of the input in messages.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def read_positions(table, pair, name):
     keep : (N,) ndarray of bool
         Rows with a position.
     rounding : float
-        Error by single precision, mas; 0 for double.
+        Rounding error of single precision, mas; 0 for double precision.
 
     Raises
     ------
@@ -104,8 +104,8 @@ def read_positions(table, pair, name):
     Warns
     -----
     WPDCWarning
-        If rows that cannot be are left out, positions are taken for radians or are in single
-        precision.
+        If rows with impossible positions are left out, or positions are taken to be radians or are
+        in single precision.
     """
     found = [_angle(table[column], column, name) for column in pair]
     values, unreadable = zip(*found, strict=True)
@@ -159,18 +159,18 @@ def read_positions(table, pair, name):
 
 
 def plain_degrees(table):
-    """Positions of some rows of a larger table, where these alone tell what they are.
+    """Positions of some rows of a larger table, if these rows suffice to interpret them.
 
     Parameters
     ----------
     table : `~astropy.table.Table`
-        Some rows: its numeric columns.
+        Numeric columns of these rows.
 
     Returns
     -------
     (ra, dec, sure) or None
-        Degrees, and whether they cannot be radians; `None` where the columns are missing, text, of
-        another unit, or of an old system.
+        Positions in deg, and whether they cannot be radians; `None` if the columns are missing,
+        are text, or have another unit or an old reference system.
     """
     pair = find_positions(spelled_names(table.colnames))
     if pair is None or pair[0].lower() in _RADIANS or _old_system(table.meta) is not None:
@@ -193,7 +193,7 @@ def plain_degrees(table):
 
 
 def _angle(column, label, name):
-    """Degrees, or what the column has without a unit; and where there is no number."""
+    """Values in deg, or as they are without a unit, and a mask of unreadable cells."""
     unit = unit_of(column)
     try:
         values, unreadable = read_numbers(column)
@@ -226,7 +226,7 @@ def _sexagesimal(column, unit, label):
 
 
 def _radians_to_degrees(table, pair, values, name):
-    """Degrees per unit of positions without a unit, which may be radians."""
+    """Factor to degrees for positions without a unit, which may be radians."""
     if any(unit_of(table[column]) is not None for column in pair):
         return 1.0
     ra, dec = values
@@ -254,23 +254,23 @@ def _radians_to_degrees(table, pair, values, name):
 
 
 def turn_to_icrs(columns, keep, meta, name):
-    """Turn positions of an old system, where the metadata name one, to ICRS.
+    """Transform positions to ICRS in place, if the metadata name an old reference system.
 
     Parameters
     ----------
     columns : dict
-        ``ra`` and ``dec``, deg, which are replaced.
+        ``ra`` and ``dec``, deg; replaced.
     keep : (N,) ndarray of bool
         Rows with a position.
     meta : dict
         Metadata of the table.
     name : str
-        What messages call the input.
+        Name of the input in messages.
 
     Raises
     ------
     CatalogError
-        If there are proper motions, which would be of the old system too.
+        If there are proper motions, which would be in the old system too.
     """
     system = _old_system(meta)
     if system is None:
@@ -285,6 +285,6 @@ def turn_to_icrs(columns, keep, meta, name):
 
 
 def _old_system(meta):
-    """Frame of astropy for the old system that metadata name, or `None`."""
+    """Astropy frame of the old system that the metadata name, or `None`."""
     words = [str(meta.get(k, "")) for k in ("RADESYS", "RADECSYS", "radesys", "COOSYS", "system")]
     return next((s for w in words if (s := _OLD_SYSTEMS.get(w.strip().upper()))), None)

@@ -1,4 +1,4 @@
-"""How far the astrometry of a star can be trusted: RUWE, errors, what is known of it."""
+"""Reliability of the astrometry of stars: RUWE and errors."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from wpdc_gwcs.columns import numbers_or_nan
 
 __all__ = ["TRUSTED_RUWE", "scale_errors"]
 
-# Up to here Gaia takes the motion of a star for that of a single one (GAIA-C3-TN-LU-LL-124-01).
+# Up to this RUWE, Gaia considers a star well described as single (GAIA-C3-TN-LU-LL-124-01).
 TRUSTED_RUWE = 1.4
 _ERRORS = ("ra_error", "dec_error", "pmra_error", "pmdec_error", "parallax_error")
 
 
 def scale_errors(catalog):
-    """Scale the errors of stars whose astrometric fit was bad by their RUWE.
+    """Scale the errors of stars with a bad astrometric fit by their RUWE.
 
     Parameters
     ----------
@@ -23,8 +23,8 @@ def scale_errors(catalog):
     Returns
     -------
     catalog : `~astropy.table.Table`
-        A copy in which all errors of the stars with a ``ruwe`` above 1.4 are larger by that
-        factor, the root of their reduced chi-square; the catalog itself where there are none.
+        A copy in which all errors of stars with a ``ruwe`` above 1.4 are multiplied by it (the
+        square root of the reduced chi-square); the catalog itself if there are no such stars.
 
     Examples
     --------

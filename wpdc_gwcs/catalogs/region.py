@@ -1,4 +1,4 @@
-"""Where on the sky stars are wanted: one or many cones."""
+"""Regions of the sky: one or more cones."""
 
 from dataclasses import dataclass
 
@@ -10,13 +10,13 @@ from wpdc_gwcs.sky import angles, directions
 
 __all__ = ["Region"]
 
-# Cones whose radii are this much alike are looked up together, with the largest of them.
+# Cones with radii within this factor are searched together, with the largest radius.
 _ALIKE = 1.1
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Part of the sky: all that is in one of some cones.
+    """Part of the sky: the union of cones.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class Region:
     Raises
     ------
     ValueError
-        If there is no cone, or one is none.
+        If there is no cone, or a cone is invalid.
 
     Examples
     --------
@@ -60,24 +60,24 @@ class Region:
 
     @classmethod
     def box(cls, west, east, south, north):
-        """Cone around a box in right ascension and declination.
+        """Return a cone around a box in right ascension and declination.
 
         Parameters
         ----------
         west, east : float
-            Right ascension, deg: from `west` upwards to `east`, across 0 where it is less.
+            Right ascension, deg: increasing from `west` to `east`, across 0 if `east` is less.
         south, north : float
             Declination, deg.
 
         Returns
         -------
         Region
-            A single cone.
+            Region of a single cone.
 
         Raises
         ------
         ValueError
-            If the box is none.
+            If the box is invalid.
         """
         if not (np.isfinite([west, east]).all() and -90 <= south < north <= 90):
             raise ValueError(
@@ -90,30 +90,30 @@ class Region:
         center = directions(west + width / 2, (south + north) / 2)[0]
         far = np.linalg.norm(directions(ra, dec)[0] - center[:, None], axis=0).max()
         center = angles(center)
-        # What may stick out between the points of the rim.
+        # Allows for the curved rim between these points.
         margin = 2 * max(width, north - south) / 64
         radius = np.degrees(2 * np.arcsin(min(far / 2, 1.0))) + margin
         return cls(center[0], center[1], min(radius, 180.0))
 
     def widened(self, factor, margin):
-        """Make every cone wider.
+        """Return the region with every cone widened.
 
         Parameters
         ----------
         factor : float
-            By this factor.
+            Factor on the radii.
         margin : float
-            And by this many degrees.
+            Margin added to the radii, deg.
 
         Returns
         -------
         Region
-            With the same centers.
+            Region with the same centers.
         """
         return Region(self.ra, self.dec, np.minimum(factor * self.radius + margin, 180.0))
 
     def contains(self, ra, dec, reach=0.0):
-        """Tell which positions are in the region.
+        """Mark positions that are in the region.
 
         Parameters
         ----------
@@ -125,7 +125,7 @@ class Region:
         Returns
         -------
         (N,) ndarray of bool
-            True inside; a few just outside a cone that is nearly as large as others count as well.
+            True inside; positions just outside a cone of a group of similar radii may be included.
         """
         points = directions(ra, dec)[0].reshape(3, -1).T
         inside = np.zeros(len(points), bool)
@@ -137,7 +137,7 @@ class Region:
             alike = group == one
             chord = 2 * np.sin(np.radians(radius[alike].max()) / 2)
             todo = np.flatnonzero(finite & ~inside)
-            # The bound itself is excluded.
+            # The search excludes its bound.
             bound = chord * (1 + 1e-12) + 1e-15
             near, _ = cKDTree(centers[alike]).query(points[todo], distance_upper_bound=bound)
             inside[todo] = np.isfinite(near)

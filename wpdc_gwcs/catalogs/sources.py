@@ -1,4 +1,4 @@
-"""Where reference stars come from: a file, Gaia's archive, a partitioned catalog."""
+"""Sources of reference stars: a file, the Gaia archive, a partitioned catalog."""
 
 from wpdc_gwcs.catalogs.gaia import GaiaArchive
 from wpdc_gwcs.catalogs.hats import HatsCatalog
@@ -7,24 +7,24 @@ __all__ = ["catalog_source"]
 
 
 def catalog_source(source, *, url=None, cache=None, max_mag=None):
-    """Tell what a word means that is to be a catalog.
+    """Interpret the name of a catalog.
 
     Parameters
     ----------
     source : object
         ``"gaia"``, ``"hats:PATH"``, or anything else.
     url : str, optional
-        Address of the service, of ``"gaia"`` alone; see `GaiaArchive`.
+        Address of the service, for ``"gaia"`` alone; see `GaiaArchive`.
     cache : path-like, optional
-        Folder of what came from there.
+        Cache folder of the service.
     max_mag : float, optional
-        Magnitude of the faintest stars asked for.
+        Magnitude of the faintest stars to request.
 
     Returns
     -------
     object
-        `GaiaArchive` or `HatsCatalog`; else what was given, such as the path of a file, which is
-        ``./gaia`` if it has that name.
+        A `GaiaArchive` or `HatsCatalog`; otherwise `source` itself, such as the path of a file.  A
+        file named ``gaia`` must be given as ``./gaia``.
     """
     if not isinstance(source, str):
         return source

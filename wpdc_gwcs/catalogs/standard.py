@@ -1,4 +1,4 @@
-"""Reading of a reference catalog: from any table to the checked one."""
+"""Reference catalogs from any table: names, units and values checked."""
 
 import logging
 import re
@@ -43,7 +43,7 @@ __all__ = ["identity_of", "known_names", "read_catalog"]
 
 log = logging.getLogger(__name__)
 
-# Output column -> aliases best first; without a unit it is that of the output.
+# Output column -> aliases, best first; a column without a unit has that of the output.
 _OPTIONAL = {
     "pmra": ("pmra", "pm_ra_cosdec", "pmra_cosdec", "pmracosdec", "pm_ra", "pmalpha_j2000"),
     "pmdec": ("pmdec", "pm_dec", "pmde", "pmdelta_j2000"),
@@ -75,19 +75,19 @@ _MAGNITUDES = (
     "kmag",
 )
 _COLORS = ("bp_rp", "bp-rp", "bprp")
-# Where there is no color, it is the difference of these.
+# If there is no color, it is the difference of these magnitudes.
 _BLUE = ("phot_bp_mean_mag", "bpmag", "bp_mag")
 _RED = ("phot_rp_mean_mag", "rpmag", "rp_mag")
-# Numbers that stand for none: no measurement is exactly one of them, least of all twice.
+# Numbers that mean "no value": no measurement is exactly one of them.
 _SENTINELS = np.array([s * n for n in (999.0, 9999.0, 99999.0, 1e20, 1e30) for s in (1, -1)])
-# Magnitudes beyond stand for none (99, -99).
+# Magnitudes beyond this mean "no value" (99, -99).
 _MOST_MAG = 90.0
 _MARK = "wpdc_catalog"
 _IDENTITY = "wpdc_identity"
 
 
 def read_catalog(source, *, format=None, region=None):
-    """Read a reference catalog and bring it to one form.
+    """Read a reference catalog into a table with standard columns and units.
 
     Parameters
     ----------
@@ -97,40 +97,40 @@ def read_catalog(source, *, format=None, region=None):
         memory; ``"gaia"`` for the archive (`GaiaArchive`), ``"hats:PATH"`` for a `HatsCatalog`.
         Columns may have Gaia, VizieR or SExtractor names in any case.
     format : str, optional
-        Format name for `astropy.table.Table.read` where the file name does not tell.
+        Format name for `astropy.table.Table.read`, if the file name does not tell.
     region : Region, optional
-        What is needed.  Of an archive, a partitioned catalog or a file of more than 32 MB (FITS,
-        CSV, ECSV, Parquet) no more is kept in memory; others are given whole.
+        The part of the sky that is needed.  For an archive, a partitioned catalog or a file of more
+        than 32 MB (FITS, CSV, ECSV, Parquet), only this part is returned; others are returned
+        whole.
 
     Returns
     -------
     catalog : `~astropy.table.Table`
         Plain float64 columns as listed in `wpdc_gwcs.catalogs`.  Rows without a usable position
-        and further rows of a star are left out; ``catalog_index`` tells the row of the input.
+        and repeated rows of a star are left out; ``catalog_index`` is the row in the input.
 
     Raises
     ------
     CatalogError
-        If the file cannot be read, has no rows or no position columns, if a unit or most values
-        of a position are impossible; if an archive does not answer, or no region is given where
-        one is needed.
+        If the file cannot be read, has no rows or no position columns, or has an impossible unit
+        or mostly impossible positions; if an archive does not answer, or a region is needed and
+        not given.
 
     Warns
     -----
     WPDCWarning
-        If there are proper motions and nothing says at which epoch the positions are, if rows or
-        columns that cannot be read are left out, rows are copies of others, or positions are in
-        single precision.
+        If there are proper motions but no epoch of the positions, if unreadable rows or columns
+        are left out, if rows repeat others, or if positions are in single precision.
 
     Notes
     -----
     A column without a unit is taken to be in the unit of the Gaia archive (deg, mas, mas / yr, yr);
-    ``ERRA_WORLD`` and its kin in deg.  The epoch is that of the column ``ref_epoch``, else of the
-    table's metadata, else of the Gaia release that the metadata names.
+    ``ERRA_WORLD`` and similar ones in deg.  The epoch is that of the column ``ref_epoch``, or
+    else of the metadata of the table, or of the Gaia release that these name.
 
-    Rows are one star, of which the row with the most complete and most precise values is kept,
-    where their ``source_id`` is the same and they are within 2 arcsec, or as `group_copies` tells
-    from positions, errors and magnitudes.
+    Rows are the same star if they have the same ``source_id`` and are within 2 arcsec, or if
+    `group_copies` finds so from positions, errors and magnitudes.  The row with the most complete
+    and most precise values is kept.
 
     Examples
     --------
@@ -179,7 +179,7 @@ def read_catalog(source, *, format=None, region=None):
 
 
 def known_names():
-    """Names of columns that `read_catalog` looks at.
+    """Return the names of the columns that `read_catalog` uses.
 
     Returns
     -------
@@ -192,7 +192,7 @@ def known_names():
 
 
 def identity_of(catalog):
-    """Tell what a part of a catalog is a part of.
+    """Return the identity of the catalog that a part was read from.
 
     Parameters
     ----------
@@ -202,13 +202,13 @@ def identity_of(catalog):
     Returns
     -------
     str or None
-        The same for all parts; `None` of a catalog that was read whole.
+        The same for all parts; `None` for a catalog that was read whole.
     """
     return catalog.meta.get(_IDENTITY)
 
 
 def _standardize_part(table, name, rows, identity):
-    """Build the checked table of a part, which may have no stars at all."""
+    """Build the checked table of a part, which may be empty."""
     if len(table) == 0:
         part = Table({c: unit_column(c, np.zeros(0)) for c in ("ra", "dec")})
         part["catalog_index"] = np.zeros(0, int)
@@ -220,18 +220,18 @@ def _standardize_part(table, name, rows, identity):
 
 
 def _read_part(path, format, region):
-    """Rows of a region, of a file that is too large to be read whole; `None` of others."""
+    """Rows of a region from a file that is too large to be read whole; `None` for others."""
     path, extension = split_extension(path)
     if region is None or format is not None or not path.is_file():
         return None
     try:
-        # As for whole files: what the readers warn of is checked afterwards.
+        # As for whole files: warnings of the readers are ignored; the checks come later.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             pieces = pieces_of(path.absolute(), extension, known_names())
             return None if pieces is None else part_of(pieces, region)
     except READ_ERRORS as problem:
-        # Whoever reads it whole tells what is wrong with it.
+        # Reading it whole will report what is wrong.
         log.info("%s: cannot be read in pieces: %s", path, problem)
         return None
 
@@ -242,7 +242,7 @@ def _file_identity(source):
 
 
 def _read_table(path, format):
-    """Read a table from a file; a `CatalogError` whatever goes wrong."""
+    """Read a table from a file; raise a `CatalogError` whatever goes wrong."""
     path, extension = split_extension(path)
     try:
         if not path.exists():
@@ -251,7 +251,7 @@ def _read_table(path, format):
             raise CatalogError(f"{path}: catalog must be a file, is {what}")
         if path.is_file() and path.stat().st_size == 0:
             raise CatalogError(f"{path}: catalog must not be empty, the file has 0 bytes")
-        # The readers warn of odd units and headers; what matters of that is checked afterwards.
+        # The readers warn of odd units and headers; what matters is checked later.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if format in (None, "fits") and is_fits(path):
@@ -284,7 +284,7 @@ def _table_of_coordinates(coordinates):
 
 
 def _standardize(table, name, rows=None):
-    """Build the checked table; `name` is what messages call the input, `rows` where they were."""
+    """Build the checked table; `name` is for messages, `rows` are row numbers in the input."""
     if len(table) == 0:
         raise CatalogError(f"{name}: catalog must have at least one row, has 0")
     spelled = spelled_names(table.colnames)
@@ -322,11 +322,11 @@ def _standardize(table, name, rows=None):
         result["source_id"] = identifiers[keep]
     index = np.arange(len(table)) if rows is None else rows
     if isinstance(table.meta.get(_MARK), str) and "catalog_index" in table.colnames:
-        # What read_catalog returned, possibly cut since: its rows keep pointing to the first input.
+        # A table from read_catalog, possibly cut: its rows keep pointing to the original input.
         index = np.asarray(table["catalog_index"])
     result["catalog_index"] = index[keep]
     if "pm_from_neighbors" in spelled and table[spelled["pm_from_neighbors"]].dtype.kind == "b":
-        # Else a second reading would take what has been filled for measured.
+        # Otherwise, a second reading would take filled-in values for measured ones.
         result["pm_from_neighbors"] = np.asarray(table[spelled["pm_from_neighbors"]])[keep]
     result.meta[_MARK] = name
     if _IDENTITY in table.meta and _MARK in table.meta:
@@ -335,7 +335,7 @@ def _standardize(table, name, rows=None):
 
 
 def _positions_of_coordinates(table, name):
-    """Take the positions from a column of coordinates, where there is one."""
+    """Take the positions from a column of coordinates, if there is one."""
     found = next((c for c in table.colnames if isinstance(table[c], SkyCoord)), None)
     if found is None:
         raise CatalogError(
@@ -352,7 +352,7 @@ def _positions_of_coordinates(table, name):
 
 
 def _optional(table, column, unit, name):
-    """Values of a column that may be missing; `None`, and a warning, where it cannot be read."""
+    """Values of an optional column; `None`, with a warning, if it cannot be read."""
     unit = u.dimensionless_unscaled if unit is None else unit
     given = unit_of(table[column], unit)
     try:
@@ -379,10 +379,10 @@ def _optional(table, column, unit, name):
 
 
 def _magnitudes(table, spelled, aliases, name):
-    """Magnitudes of the first of some columns that can be read, or `None`."""
+    """Magnitudes from the first readable one of some columns, or `None`."""
     for alias in aliases:
         if alias in spelled:
-            # the order counts: the unit does not
+            # only the order matters, so any unit will do
             column = table[spelled[alias]]
             plain = Table({spelled[alias]: getattr(column, "value", column)}, copy=False)
             plain[spelled[alias]].unit = None
@@ -394,14 +394,14 @@ def _magnitudes(table, spelled, aliases, name):
 
 
 def _add_ellipse_errors(columns, table, spelled, name):
-    """Errors of SExtractor and SCAMP: an ellipse, its angle counted from the RA axis."""
+    """Errors from SExtractor and SCAMP: an ellipse, its angle measured from the RA axis."""
     if "ra_error" in columns:
         return
     for tag in ("psf", "win", ""):
         a, b, theta = f"erra{tag}_world", f"errb{tag}_world", f"errtheta{tag}_world"
         if a not in spelled or b not in spelled:
             continue
-        # SExtractor's world coordinates are in degrees, also where the file does not say so.
+        # SExtractor's world coordinates are in degrees, even if the file does not say so.
         major, minor = (_angle_or_none(table, spelled[c], u.mas, name) for c in (a, b))
         angle = np.zeros(len(table))
         if theta in spelled:
@@ -423,7 +423,7 @@ def _angle_or_none(table, column, unit, name):
 
 
 def _colors(table, spelled, name):
-    """Find the color of every star, or `None` where the table has neither it nor both bands."""
+    """Color of every star, or `None` if the table has neither a color nor both magnitudes."""
     found = find_name(spelled, _COLORS)
     color = None if found is None else _magnitudes(table, spelled, (found.lower(),), name)
     bands = [_magnitudes(table, spelled, aliases, name) for aliases in (_BLUE, _RED)]

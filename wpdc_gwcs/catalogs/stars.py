@@ -1,4 +1,4 @@
-"""The stars of a catalog: one row for each."""
+"""Repeated rows of a star in a catalog."""
 
 import warnings
 
@@ -11,34 +11,34 @@ from wpdc_gwcs.sky import directions, move
 
 __all__ = ["one_of_each", "read_identifiers"]
 
-# Copies of one star are no further apart than that, arcsec; rows of one identifier twice as much.
+# Largest distance of copies of a star, arcsec; twice this for rows with the same identifier.
 _COPY_REACH = 1.0
 _MAS = np.pi / 180.0 / 3.6e6
 
 
 def one_of_each(columns, keep, identifiers, name):
-    """Mark one row for each star among those that are kept.
+    """Mark one row per star among the rows that are kept.
 
     Parameters
     ----------
     columns : dict
-        Checked columns.
+        Columns of the checked table.
     keep : (N,) ndarray of bool
-        Rows that are kept so far.
+        Rows kept so far.
     identifiers : (N,) ndarray or None
-        Names of the stars.
+        Identifiers of the stars.
     name : str
-        What messages call the input.
+        Name of the input in messages.
 
     Returns
     -------
     (n,) ndarray of bool
-        Mask over the rows that are kept: the one with most and most precise values of each star.
+        Mask over the kept rows: for each star, the row with the most and most precise values.
 
     Warns
     -----
     WPDCWarning
-        If there are further rows of a star.
+        If rows repeat a star.
     """
     part = {c: v[keep] for c, v in columns.items()}
     n = len(part["ra"])
@@ -78,7 +78,7 @@ def one_of_each(columns, keep, identifiers, name):
 
 
 def _at_one_epoch(part):
-    """Positions at one epoch, where rows differ in theirs and have motions."""
+    """Positions at a common epoch, if the rows have different epochs and motions."""
     ra, dec = part["ra"], part["dec"]
     if not {"pmra", "pmdec", "ref_epoch"} <= set(part) or np.ptp(part["ref_epoch"]) == 0:
         return ra, dec
@@ -92,7 +92,7 @@ def _at_one_epoch(part):
 
 
 def _same_identifier(identifiers, points):
-    """Pairs of rows of one identifier; none where identifiers do not tell stars apart."""
+    """Pairs of rows with the same identifier; none if identifiers are not unique to stars."""
     order = np.argsort(identifiers, kind="stable")
     i, j = order[:-1], order[1:]
     same = (identifiers[i] == identifiers[j]) & (identifiers[i] > 0)
@@ -102,7 +102,7 @@ def _same_identifier(identifiers, points):
 
 
 def read_identifiers(table, spelled):
-    """Read whole numbers that name the stars.
+    """Read integer identifiers of the stars.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def read_identifiers(table, spelled):
     Returns
     -------
     (N,) ndarray or None
-        0 where there is none; `None` without such a column.
+        Identifiers, 0 for none; `None` without such a column.
     """
     if "source_id" not in spelled:
         return None

@@ -24,7 +24,7 @@ UNITS = {
 
 
 def unit_column(name, values):
-    """Make a column with the unit of its name.
+    """Build a column with the standard unit for its name.
 
     Parameters
     ----------
@@ -36,6 +36,6 @@ def unit_column(name, values):
     Returns
     -------
     `~astropy.table.Column`
-        Without a unit where the name has none.
+        The column; dimensionless if its name has no unit.
     """
     return Column(values, unit=UNITS.get(name))

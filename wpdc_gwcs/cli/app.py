@@ -1,8 +1,8 @@
-"""The `wpdc` application: its commands, and what becomes of errors, warnings and Ctrl-C.
+"""The `wpdc` application: its commands, and the handling of errors, warnings and signals.
 
-Exit status: 0 all is well; 1 a frame could not be solved, or a result failed its test; 2 wrong
-usage or unreadable input; 130 interrupted, 143 told to end.  Every failure is one line on standard
-error that says what, which rule and which value.
+Exit status: 0 success; 1 a frame could not be solved, or a result failed its test; 2 wrong usage or
+unreadable input; 130 interrupted, 143 terminated.  Every failure is one line on standard error with
+the problem, the rule and the value.
 """
 
 import gc
@@ -32,7 +32,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-# The common base of what the command-line parser complains about; typer exports only a subclass.
+# Base class of errors of the command-line parser; typer exports only a subclass.
 UsageError = typer.BadParameter.__bases__[0]
 
 _INTERRUPTED = 130
@@ -118,7 +118,7 @@ def run(args=None):
     set_verbosity(0, quiet=False)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            # Names may have characters that the terminal has not.
+            # Names may have characters that the terminal cannot show.
             stream.reconfigure(errors="backslashreplace")
     with _signals() as received:
         return _run(args, received)
@@ -126,9 +126,9 @@ def run(args=None):
 
 @contextmanager
 def _signals():
-    """Take the signals that end a program as one interruption, after which nothing disturbs.
+    """Turn signals that end a program into one KeyboardInterrupt, and ignore further ones.
 
-    The list that is given holds the signal that came.
+    Yields a list with the number of the signal.
     """
     received = []
 
@@ -142,7 +142,7 @@ def _signals():
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
     before = {}
     if threading.current_thread() is threading.main_thread():
-        # What is ignored, as SIGHUP under nohup, stays so.
+        # Signals that are ignored, such as SIGHUP under nohup, stay ignored.
         before = {n: signal.getsignal(n) for n in numbers if signal.getsignal(n) != signal.SIG_IGN}
     for number in before:
         signal.signal(number, interrupt)
@@ -170,7 +170,7 @@ def _run(args, received):
         status = 128 + received[0] if received else _INTERRUPTED
         return _fail("interrupted; files already written are complete", status)
     except BrokenPipeError:
-        # The reader of our output has gone, which is no error; the exit must not flush again.
+        # The reader of our output is gone, which is not an error; the exit must not flush again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as err:
@@ -199,13 +199,13 @@ def main():
     """Entry point of the `wpdc` command."""
     status = run()
     if status > 128:
-        # All is in order, and who stops a program does not want to wait until the interpreter has
-        # collected what is left of a run: ten seconds where the machine is busy.
+        # Everything is written, and a user who stops a program does not want to wait for garbage
+        # collection: ten seconds on a busy machine.
         with suppress(OSError, ValueError, AttributeError):
             sys.stdout.flush()
             sys.stderr.flush()
         os._exit(status)
-    # The system takes back what is left of a run: to look through it for cycles takes an eighth of
-    # the time of a small frame.
+    # The system frees the memory anyway; a final search for cycles takes an eighth of the time of a
+    # small frame.
     gc.freeze()
     sys.exit(status)

@@ -47,7 +47,7 @@ from wpdc_gwcs.exceptions import InputError, InternalError
 
 log = logging.getLogger("wpdc_gwcs.cli")
 
-# More frames than this are not told one by one.
+# Maximum number of frames that are reported one by one.
 _MOST_LINES = 100
 
 Catalog = Annotated[
@@ -367,7 +367,7 @@ def stored_solutions(paths):
     Returns
     -------
     DistortionSolution or dict or None
-        A single solution as it is, several by their detectors, `None` without files.
+        A single solution, or several by the names of their detectors; `None` without files.
     """
     from wpdc_gwcs.camera import Camera
     from wpdc_gwcs.io import read
@@ -395,21 +395,21 @@ def stored_solutions(paths):
 
 
 def tell_hints(failures, sources, **given):
-    """Print what to try with the frames that failed, once for each kind of reason.
+    """Print what to try with failed frames, once for each kind of reason.
 
     Parameters
     ----------
     failures : dict
-        Frame name to error.
+        Errors by frame name.
     sources : dict
-        Frame name to its path.
+        Paths by frame name.
     **given
         As for `hint_of_frame`.
     """
     told = set()
     for name, error in failures.items():
         hint = hint_of_frame(error, sources[name], **given)
-        # Hints of one kind differ by the frame alone.
+        # Hints of the same kind differ only in the frame.
         kind = None if hint is None else hint.replace(shlex.quote(sources[name]), "")
         if kind is not None and kind not in told:
             told.add(kind)
@@ -417,12 +417,12 @@ def tell_hints(failures, sources, **given):
 
 
 def print_changes(run):
-    """Print what an update has changed.
+    """Print the changes that an update has made.
 
     Parameters
     ----------
     run : CalibrationRun
-        What was found.
+        Result of the run.
     """
     for name, solution in run.solutions.items():
         if not solution.statistics.get("updates"):
@@ -446,14 +446,14 @@ def print_changes(run):
 
 
 def print_summary(run, folder):
-    """Print a line per frame and what was written.
+    """Print a line per frame and the folder of the results.
 
     Parameters
     ----------
     run : CalibrationRun
-        What was found.
+        Result of the run.
     folder : Path
-        Where the results are.
+        Folder of the results.
     """
     shown = run.summary
     if len(shown) > _MOST_LINES:

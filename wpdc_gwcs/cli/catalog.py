@@ -1,4 +1,4 @@
-"""`wpdc catalog`: reference catalogs prepared, and told about."""
+"""`wpdc catalog`: prepare and describe reference catalogs."""
 
 import logging
 import re
@@ -37,7 +37,7 @@ Around = Annotated[
     typer.Option(metavar="FRAME", help="Part of the sky: around this frame (once for each)."),
 ]
 
-# What a column that is not there would have been for.
+# Purpose of columns, reported if they are missing.
 _PURPOSES = {
     "pmra": "stars stay where they were at the epoch of the catalog",
     "ref_epoch": "2016.0 is assumed",
@@ -169,7 +169,7 @@ def info_command(
 
 
 def lines_about(stars):
-    """Tell what a catalog has.
+    """Describe a catalog.
 
     Parameters
     ----------
@@ -179,13 +179,13 @@ def lines_about(stars):
     Yields
     ------
     label, text : str
-        A line.
+        Label and text of a line.
     """
     from wpdc_gwcs.catalogs.overview import sky_area
     from wpdc_gwcs.columns import numbers_or_nan
 
     ra, dec = (np.asarray(stars[name], float) for name in ("ra", "dec"))
-    # From the end of the widest gap, so that RA 0 is no border.
+    # From the end of the widest gap, so that the range may include RA 0.
     order = np.sort(ra)
     gaps = np.diff(order, append=order[0] + 360)
     west, east = order[(np.argmax(gaps) + 1) % len(order)], order[np.argmax(gaps)]
@@ -225,7 +225,7 @@ def _read(name, region, *, tap_url=None, cache=None, max_mag=None):
 
 
 def _sky(cone, box, around):
-    """Region to be read, and what tells which stars of it are wanted."""
+    """Region to read, and a function that selects the stars inside."""
     from wpdc_gwcs.catalogs import Region
 
     if sum(bool(given) for given in (cone, box, around)) > 1:

@@ -1,4 +1,4 @@
-"""`wpdc demo`: from a simulation to a WCS that is held against the truth."""
+"""`wpdc demo`: from a simulation to a WCS that is compared with the truth."""
 
 import time
 from pathlib import Path
@@ -13,7 +13,7 @@ from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.cli.simulate import write_files
 from wpdc_gwcs.exceptions import InputError
 
-# The demo fails if the delivered WCS is further off its own truth than this, px rms.
+# The demo fails if the error of the delivered WCS exceeds this, px rms.
 DEMO_LIMIT = 0.02
 
 
@@ -71,11 +71,11 @@ def draw_demo(exposure, calibration, error, folder):
     exposure : SimulatedExposure
         The exposure, with its truth.
     calibration : Calibration
-        What was found of it.
+        Its calibration.
     error : tuple of ndarray
         Grid positions and error of the calibrated WCS, px.
     folder : Path
-        Where the pictures go.
+        Folder for the pictures.
     """
     from wpdc_gwcs import plotting
 
@@ -98,20 +98,20 @@ def draw_demo(exposure, calibration, error, folder):
 
 
 def print_demo(simulation, solved, errors, output, seconds):
-    """Print the error of each exposure against its truth, before and after.
+    """Print the error of each exposure against its truth, before and after calibration.
 
     Parameters
     ----------
     simulation : Simulation
-        The exposures with their truth.
+        Exposures with their truth.
     solved : dict
-        Exposure name to calibration.
+        Calibrations by exposure name.
     errors : list of tuple
-        Grid error of each solved exposure.
+        Errors on a grid for each solved exposure.
     output : Path
-        Where the results are.
+        Folder of the results.
     seconds : float
-        How long it took.
+        Duration, s.
     """
     typer.echo("                stars           error of the WCS against the truth [px]")
     typer.echo("exposure      matched   header rms   calibrated rms     90 %      max")

@@ -1,4 +1,4 @@
-"""`wpdc evaluate`: residuals of frames, detectors and runs, and the truth where it is known."""
+"""`wpdc evaluate`: residuals of frames, detectors and runs, and comparison with a truth."""
 
 from dataclasses import replace
 from functools import partial
@@ -21,7 +21,7 @@ from wpdc_gwcs.cli.options import (
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import FitError, InputError
 
-# More frames than this are not printed one by one.
+# Maximum number of frames that are printed one by one.
 _MOST_FRAMES = 40
 
 
@@ -196,7 +196,7 @@ def _weight_names(text):
 
 
 def _files(output, names, overwrite):
-    """Names of tables to the files that they are written to."""
+    """Output files by the names of tables."""
     if output is None:
         return {}
     files = {
@@ -239,7 +239,7 @@ def _write_paper_table(pooled, path, overwrite):
 
 
 def _score(calibrations, folder, cuts, limit):
-    """Scores of the frames, and pooled."""
+    """Scores of the frames, and pooled scores."""
     from wpdc_gwcs.evaluation import pool_scores, score_frame
     from wpdc_gwcs.io import read_truth
 
@@ -273,7 +273,7 @@ def _print_tables(tables):
 
 
 def _print_statistics(table):
-    """Print statistics, the numbers of stars first, then px with four digits."""
+    """Print statistics: numbers of stars first, then values in px with four digits."""
     words = [name for name in table.colnames if table[name].dtype.kind == "U"]
     for name in table.colnames:
         if table[name].dtype.kind == "f":
@@ -284,7 +284,7 @@ def _print_statistics(table):
 
 
 class _EvaluatedFrame:
-    """Matches of a frame within the limits, and its calibration where that is beside them."""
+    """Matches of a frame within the limits, and its calibration if the file is there."""
 
     def __init__(self, path, cuts):
         from wpdc_gwcs.io import read, read_matches
@@ -319,9 +319,9 @@ class _EvaluatedFrame:
 
 
 def _compare_weights(calibrations, weights, degree, cuts):
-    """Detector to results of the weights, for the frames whose calibration is known.
+    """Results of the weights by detector, for frames with a known calibration.
 
-    All stars are fitted; what is shown is within the limits on places.
+    All stars are fitted; the results are for stars within the limits on position.
     """
     from wpdc_gwcs.evaluation import compare_weights
 

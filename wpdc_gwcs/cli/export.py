@@ -1,4 +1,4 @@
-"""The WCS to other programs and from them: `export`, `convert`."""
+"""Exchange of WCSs with other programs: `export`, `convert`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +11,8 @@ from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
 
-# What SWarp makes of TPV is told where it is worse than for others by this factor, and not nothing.
+# The deviation in SWarp is reported if it exceeds that of other readers by this factor and is not
+# negligible.
 _AS_GOOD = 1.1
 _TOLD_PX = 1e-3
 FORMATS = ("fits", "cpdis", "tpv", "head", "sip", "tab", "stock")
@@ -104,12 +105,12 @@ def _into(calibration, image, format, degree, output, alternates, overwrite):
 
 
 def write_as(calibration, output, format, *, degree=None, overwrite=False):
-    """Write a calibration in a format and say in words how good it is.
+    """Write a calibration in a format, and describe the accuracy.
 
     Parameters
     ----------
     calibration : Calibration or DistortionSolution
-        What to write.
+        Calibration to write.
     output : Path
         File to write.
     format : str
@@ -122,7 +123,7 @@ def write_as(calibration, output, format, *, degree=None, overwrite=False):
     Returns
     -------
     note : str
-        To be printed behind the name of the format.
+        Text to print after the name of the format.
     """
     from wpdc_gwcs.export import FORMS
     from wpdc_gwcs.io import write
@@ -137,17 +138,17 @@ def write_as(calibration, output, format, *, degree=None, overwrite=False):
 
 
 def _greatest(worst):
-    return "" if worst is None else f" (greatest deviation {worst:.2g} px)"
+    return "" if worst is None else f" (largest deviation {worst:.2g} px)"
 
 
 def _note(made):
     if (made.swarp_deviation or 0.0) > max(_AS_GOOD * (made.deviation or 0.0), _TOLD_PX):
         return (
-            f" (greatest deviation {made.deviation:.2g} px, in SWarp {made.swarp_deviation:.2g} px)"
+            f" (largest deviation {made.deviation:.2g} px, in SWarp {made.swarp_deviation:.2g} px)"
         )
     if made.form != "fits":
         return _greatest(made.deviation)
-    exact = "exact" if made.deviation is None else f"greatest deviation {made.deviation:.2g} px"
+    exact = "exact" if made.deviation is None else f"largest deviation {made.deviation:.2g} px"
     if made.keywords_deviation is None:
         return f" ({exact} for wpdc_gwcs)"
     return (

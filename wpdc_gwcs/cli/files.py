@@ -1,4 +1,4 @@
-"""Commands on results: `pix2sky`, `sky2pix`."""
+"""Coordinate transforms with result files: `pix2sky`, `sky2pix`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -26,17 +26,17 @@ Output = Annotated[
 
 
 def read_one(file):
-    """Read a file that has one WCS.
+    """Read a file with a single WCS.
 
     Parameters
     ----------
     file : Path
-        Of a frame or of a detector.
+        File of a frame or of a detector.
 
     Returns
     -------
     Calibration or DistortionSolution
-        What is in it; a camera is refused.
+        Its content; a camera is refused.
     """
     from wpdc_gwcs.camera import Camera
     from wpdc_gwcs.io import read
@@ -139,17 +139,17 @@ def _transform_table(path, names, transform, output, overwrite):
 
 
 def match_files(paths):
-    """Match tables behind files and folders, in order.
+    """List the match tables of files and folders, in order.
 
     Parameters
     ----------
     paths : list of Path
-        Match tables, WCS files with their match tables beside them, or folders of these.
+        Match tables, WCS files with match tables next to them, or folders of these.
 
     Returns
     -------
     list of Path
-        Paths of match tables, all there.
+        Paths of existing match tables.
     """
     found = []
     for path in paths:

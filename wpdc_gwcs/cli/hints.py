@@ -1,7 +1,7 @@
-"""What to try next, for every kind of error: in one place, so that none is forgotten.
+"""Hints what to try next, for every kind of error, in one place.
 
-A hint is a command, or an option of the one that failed.  Rules are asked in turn; an error whose
-message says already what to do has none.
+A hint is a command, or an option of the command that failed.  The first matching rule applies; a
+message that already says what to do needs no hint.
 """
 
 import difflib
@@ -14,7 +14,7 @@ from wpdc_gwcs.exceptions import InternalError
 
 __all__ = ["hint_of", "hint_of_frame"]
 
-# Messages of errors that end a command, and what to try; "{path}" is what the message begins with.
+# Messages of errors that end a command, and hints; "{path}" is the path that begins the message.
 _OF_COMMANDS = (
     (
         r"(?P<path>.+?): (?:catalog must be an existing file|must be a readable file: No such file"
@@ -69,7 +69,7 @@ _OF_COMMANDS = (
     (r".*would both write", "different names, or one run for each of them"),
     (r"exposure .*left out|all \d+ exposures were left out", "wpdc explain FRAME --catalog CAT"),
 )
-# Reasons of frames that failed; the first of each kind has its hint.
+# Reasons of failed frames, and hints.
 _EXPLAIN = "wpdc explain {frame} --catalog {catalog}{wcs} --output why.png"
 _OF_FRAMES = (
     (r".*the catalog has no star within", "wpdc catalog prepare gaia --around {frame} --output "
@@ -96,17 +96,17 @@ _OF_FRAMES = (
 
 
 def hint_of(message):
-    """Tell what to try after an error that ends a command.
+    """Return a hint for an error that ends a command.
 
     Parameters
     ----------
     message : str
-        Of the error.
+        Message of the error.
 
     Returns
     -------
     str or None
-        None where the message says it itself.
+        The hint; None if the message itself says what to do.
     """
     for pattern, hint in _OF_COMMANDS:
         found = re.match(pattern, message, re.DOTALL)
@@ -120,23 +120,23 @@ def hint_of(message):
 
 
 def hint_of_frame(error, source, *, catalog, wcs=None):
-    """Tell what to try with a frame that was not solved.
+    """Return a hint for a frame that was not solved.
 
     Parameters
     ----------
     error : WPDCError
-        Why it was not.
+        The reason.
     source : str
-        Where it came from.
+        Path of the frame.
     catalog : str
-        Catalog of the command.
+        Catalog on the command line.
     wcs : str, optional
-        Header of the command.
+        Header on the command line.
 
     Returns
     -------
     str or None
-        None where the reason says it itself.
+        The hint; None if the reason itself says what to do.
     """
     parts = {
         "frame": shlex.quote(source),
@@ -154,7 +154,7 @@ def hint_of_frame(error, source, *, catalog, wcs=None):
 
 
 def _similar(path):
-    """Name a file that may be meant, or what is missing on the way to it."""
+    """Suggest an existing file with a similar name, or name the missing folder."""
     path = Path(re.sub(r"\[[^\[\]]*\]$", "", path))
     folder = path.parent
     if not folder.is_dir():

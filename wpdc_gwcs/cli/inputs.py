@@ -1,4 +1,4 @@
-"""Many files in few words: folders, patterns in quotes, and lists of files."""
+"""Paths from folders, quoted patterns and lists of files."""
 
 import glob
 import os
@@ -9,30 +9,30 @@ from wpdc_gwcs.exceptions import InputError
 
 __all__ = ["expand_paths"]
 
-# What the files of frames are called.
+# Suffixes of frame files.
 _FRAME = re.compile(r"\.(fits?|fts|cat|ldac)(\.(fz|gz|bz2|xz))?$|\.fz$", re.IGNORECASE)
 
 
 def expand_paths(given, *, without=()):
-    """Tell which files are meant, where the shell has not.
+    """Expand folders, patterns and lists to the paths of files.
 
     Parameters
     ----------
     given : iterable of str
-        Paths as they are, ``path[EXT]`` too; folders, of which FITS files and FITS_LDAC lists are
-        taken; patterns with ``*`` and ``?``; ``@FILE``, which has any of these, one in a line.
+        Paths, also ``path[EXT]``; folders, which stand for their FITS files and FITS_LDAC lists;
+        patterns with ``*`` and ``?``; ``@FILE``, a text file with one of these per line.
     without : iterable of str, optional
-        Files that lie among the frames of a folder and are none, such as the catalog.
+        Files in a folder that are not frames, such as the catalog.
 
     Returns
     -------
     list of str
-        Those of a folder or a pattern sorted by name.
+        The paths; those of a folder or a pattern are sorted by name.
 
     Raises
     ------
     InputError
-        If a list cannot be read, or there is nothing in a folder, a pattern or a list.
+        If a list cannot be read, or a folder, a pattern or a list yields no files.
     """
     others = {os.path.realpath(path) for path in without}
     return [path for one in given for path in _expand(str(one), others)]
@@ -63,7 +63,7 @@ def _expand_path(one, others):
     path, extension = re.fullmatch(r"(.*?)((?:\[[^\[\]]*\])*)", one, re.DOTALL).groups()
     if not ("*" in path or "?" in path) or os.path.lexists(one) or os.path.lexists(path):
         return [one]
-    # A bracket is an extension, or a part of a name.
+    # Brackets are an extension or part of a name, not a pattern.
     pattern = re.sub(r"\[", "[[]", path)
     found = sorted(p for p in glob.glob(pattern) if os.path.realpath(p) not in others)
     if not found:
@@ -73,7 +73,7 @@ def _expand_path(one, others):
 
 def _lines(path):
     try:
-        # As paths are: bytes that are no UTF-8 are kept.
+        # Bytes that are not UTF-8 are kept, as in other paths.
         text = os.fsdecode(path.read_bytes())
     except OSError as err:
         raise InputError(f"@{path}: the list of files must be readable: {err.strerror}") from err

@@ -1,4 +1,4 @@
-"""`wpdc monitor`: whether a stored solution still holds, today and over a survey."""
+"""`wpdc monitor`: test whether a stored solution still holds, now and over a survey."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free, requi
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
 
-# More periods than this are not told one by one.
+# Maximum number of periods that are reported one by one.
 _MOST_PERIODS = 40
 _MOST_CELLS = 5
 
@@ -134,14 +134,14 @@ def monitor_command(
 
 @dataclass(frozen=True)
 class _MonitoredFrame:
-    """Match table of a frame, of which detector and when."""
+    """Match table of a frame, with its detector and epoch."""
 
     path: Path
     detector: str | None
     epoch: float
 
     def matches(self):
-        """Read the residuals, with what a field has taken."""
+        """Read the residuals, with the part that a field has absorbed added back."""
         from wpdc_gwcs.evaluation import residuals_of_attitude
         from wpdc_gwcs.io import read, read_matches
 
@@ -176,7 +176,7 @@ def _solutions(path):
 
 
 def _frames(paths, *, need_epochs):
-    """Detector and epoch of each table, from the summary of its folder or the WCS beside it."""
+    """Detector and epoch of each table, from the summary of its folder or its WCS file."""
     known = {folder: _summary_of(folder) for folder in dict.fromkeys(p.parent for p in paths)}
     found = []
     for path in paths:
@@ -219,7 +219,7 @@ def _told_by_wcs(path, detector):
 
 
 def _of_detector(frames, name):
-    """Frames of a detector; tables that do not tell theirs are taken at their word."""
+    """Frames of a detector; tables without the name of a detector are included."""
     return [frame for frame in frames if frame.detector in (name, None)]
 
 

@@ -1,4 +1,4 @@
-"""Options that several commands share, and the files and presets they may come from."""
+"""Options that several commands share, with configuration files and presets."""
 
 import logging
 import math
@@ -47,7 +47,7 @@ log = logging.getLogger("wpdc_gwcs.cli")
 
 
 def preset_names():
-    """Names of the presets that come with the package.
+    """Return the names of the presets of the package.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def preset_names():
 
 
 def _as_defaults(ctx, text, where):
-    """Make the options in a TOML text the defaults of the command; what is typed still wins."""
+    """Make the options of a TOML text the defaults of the command; typed options still win."""
     try:
         values = tomllib.loads(text)
     except (ValueError, RecursionError) as err:  # numbers of 5,000 digits, and lists in lists
@@ -86,7 +86,7 @@ def _load_preset(ctx: typer.Context, name: str | None):
             f"unknown preset {name!r}: must be one of {', '.join(preset_names())}", ctx=ctx
         )
     text = (files("wpdc_gwcs") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
-    # A configuration file read before it on the command line still wins over the preset.
+    # A configuration file wins over the preset, even if it comes first on the command line.
     typed = dict(ctx.default_map or {})
     _as_defaults(ctx, text, f"preset {name}")
     ctx.default_map = {**ctx.default_map, **typed}
@@ -238,14 +238,14 @@ Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.",
 
 
 def by_hand(epoch, pixel_scale, origin):
-    """Check what is given in place of headers.
+    """Check options that replace header values.
 
     Parameters
     ----------
     epoch : str or None
         Epoch of the frames.
     pixel_scale : float or None
-        Scale, arcsec / px.
+        Pixel scale, arcsec / px.
     origin : int or None
         Number of the first pixel.
 
@@ -268,12 +268,12 @@ def by_hand(epoch, pixel_scale, origin):
 
 
 def settings_of(**choices):
-    """Make the settings of a calibration.
+    """Build the settings of a calibration.
 
     Parameters
     ----------
     **choices
-        As for `wpdc_gwcs.calibration.Settings`; ``degree`` is the text of its option.
+        As for `wpdc_gwcs.calibration.Settings`; ``degree`` is the text of the option.
 
     Returns
     -------
@@ -283,7 +283,7 @@ def settings_of(**choices):
     Raises
     ------
     InputError
-        If one of them cannot be.
+        If a value is invalid.
     """
     from wpdc_gwcs.calibration import Settings
 
@@ -296,18 +296,18 @@ def settings_of(**choices):
 
 
 def read_numbers(option, text, n=None, separator=","):
-    """Read the numbers of an option that has several.
+    """Parse an option with several numbers.
 
     Parameters
     ----------
     option : str
         Name of the option.
     text : str
-        What was typed.
+        Value of the option.
     n : int, optional
-        How many there must be.
+        Required count.
     separator : str, optional
-        What stands between them.
+        Separator.
 
     Returns
     -------
@@ -326,7 +326,7 @@ def read_numbers(option, text, n=None, separator=","):
 
 
 def state_first_pixel(frames):
-    """Say of which tables of sources nothing told where pixels begin.
+    """Warn of source tables that do not tell whether pixels count from 0 or 1.
 
     Parameters
     ----------
@@ -345,7 +345,7 @@ def state_first_pixel(frames):
 
 
 def require_free(path, overwrite):
-    """Refuse to go on if this file is there and may not be replaced.
+    """Raise an error if a file exists and may not be replaced.
 
     Parameters
     ----------
@@ -359,12 +359,12 @@ def require_free(path, overwrite):
 
 
 def require_plotting(what):
-    """Refuse to go on without the packages that figures need.
+    """Raise an error unless the packages for figures are installed.
 
     Parameters
     ----------
     what : str
-        What was asked for.
+        What needs them, for the message.
     """
     missing = [name for name in ("matplotlib", "jinja2") if find_spec(name) is None]
     if missing:

@@ -1,4 +1,4 @@
-"""Progress on a terminal, silence in a pipe."""
+"""Progress bar on a terminal; nothing in a pipe."""
 
 import sys
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ __all__ = ["progress_bar"]
 
 @contextmanager
 def progress_bar(*, quiet=False):
-    """Progress bar on standard error, or nothing where that is not a terminal.
+    """Show a progress bar on standard error, if that is a terminal.
 
     Parameters
     ----------
@@ -18,7 +18,7 @@ def progress_bar(*, quiet=False):
     Yields
     ------
     callable
-        To be called as ``progress(stage, done, total)``.
+        Function to call as ``progress(stage, done, total)``.
     """
     if quiet or not sys.stderr.isatty():
         yield lambda stage, done, total: None
@@ -36,11 +36,11 @@ def progress_bar(*, quiet=False):
         tasks = {}
 
         def progress(stage, done, total):
-            # Stages of a frame have no number: they take turns in one line.
+            # Stages of a frame have no total: they share one line.
             name = stage if total else None
             if name not in tasks:
                 tasks[name] = bar.add_task(stage, total=total or None)
-            # At once: those that work in C keep the thread that would do it waiting.
+            # Refresh at once: long calls in C would block the refresh thread.
             bar.update(tasks[name], completed=done, description=stage, refresh=True)
 
         yield progress

@@ -1,4 +1,4 @@
-"""`wpdc report`: one page about a run."""
+"""`wpdc report`: a page about a run."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,7 +35,7 @@ def report_command(
 
 
 class _Matches(Mapping):
-    """Match tables of the frames of a folder, each read whenever it is asked for."""
+    """Match tables of the frames of a folder, each read on access."""
 
     def __init__(self, folder, names):
         self._folder, self._names = folder, dict.fromkeys(map(str, names))
@@ -58,7 +58,7 @@ class _Matches(Mapping):
 
 
 def write_page(folder, path, *, overwrite):
-    """Write the report of a result folder, whole or not at all.
+    """Write the report of a result folder, atomically.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def write_page(folder, path, *, overwrite):
     path : Path
         File to write.
     overwrite : bool
-        Whether it may be replaced.
+        Whether an existing file may be replaced.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def write_page(folder, path, *, overwrite):
             raise FileFormatError(f"{folder / 'summary.ecsv'}: must have a column {column!r}")
     matches = _Matches(folder, summary["frame"][summary["status"] != "failed"])
     found = [read(path) for path in sorted(folder.glob("*.solution.asdf"))]
-    # What an update has superseded lies beside what is valid now.
+    # Superseded solutions of an update lie next to the valid ones.
     found.sort(key=lambda solution: solution.valid_to is None)
     solutions = {s.detector: s for s in found}
     with (
@@ -95,17 +95,17 @@ def write_page(folder, path, *, overwrite):
 
 
 def about_run(folder):
-    """Tell what the run in a folder was.
+    """Describe the run of a folder.
 
     Parameters
     ----------
     folder : Path
-        With its manifest, if there is one.
+        Result folder, perhaps with a manifest.
 
     Returns
     -------
     dict or None
-        Headings to names and values.
+        Names and values by heading; `None` without a manifest.
     """
     from wpdc_gwcs.calibration.manifest import read_manifest
 

@@ -29,7 +29,7 @@ def reproduce_command(
         typer.Option("--quick", help="Small detectors and few fields: minutes instead of hours."),
     ] = False,
     jobs: Annotated[int, typer.Option(metavar="N", help="Processes that match frames.")] = 1,
-    # SEED of the reproduction, which is imported when it is needed.
+    # SEED of the reproduction, which is imported only when needed.
     seed: Annotated[
         int, typer.Option(metavar="N", help="Another seed gives another camera.")
     ] = 9193,

@@ -1,4 +1,4 @@
-"""`wpdc show` and `wpdc explain`: what a file has in it, and why a frame came out as it did."""
+"""`wpdc show` and `wpdc explain`: the contents of a file, and the reasons of a result."""
 
 import warnings
 from pathlib import Path
@@ -36,7 +36,7 @@ Picture = Annotated[
     Path | None,
     typer.Option("--output", metavar="FILE", help="Also draw a picture: .png, .pdf or .svg."),
 ]
-# Rows of a table of reasons; the rest is counted.
+# Maximum number of rows shown; the rest is counted.
 _MOST_ROWS = 20
 
 
@@ -135,7 +135,7 @@ def _save(figure, path, *, overwrite):
 
 
 def _told(file):
-    """Lines about a file, and what draws its picture."""
+    """Lines about a file, and a function that draws its picture."""
     from wpdc_gwcs.catalogs import split_extension
     from wpdc_gwcs.io.files import file_kind
 

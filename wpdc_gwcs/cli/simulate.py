@@ -1,4 +1,4 @@
-"""`wpdc simulate`: frames whose distortion is known, with the truth about them."""
+"""`wpdc simulate`: frames with a known distortion, and their truth."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +11,7 @@ from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, read_numbers
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.exceptions import InputError
 
-# More frames than this are named by a pattern in the command that is printed.
+# Above this number, the printed command names the frames by a pattern.
 _MOST_NAMED = 8
 
 
@@ -231,14 +231,14 @@ def simulate_command(
 
 
 def write_files(simulation, folder, *, sources="ldac", **options):
-    """Write a simulation, with errors that the command line can show.
+    """Write a simulation, with errors for the command line.
 
     Parameters
     ----------
     simulation : Simulation
-        What to write.
+        Simulation to write.
     folder : Path
-        Where to.
+        Output folder.
     sources : {"ldac", "ecsv"}, optional
         Form of the source lists.
     **options
@@ -258,10 +258,10 @@ def write_files(simulation, folder, *, sources="ldac", **options):
 
 
 def _commands(files, folder):
-    """Commands that calibrate what was written."""
+    """Commands that calibrate the written frames."""
     frames, catalog = files["frames"], files["reference"]
     if any(header is not None for header in files["headers"]):
-        # A table has one header on the command line, so each is a run of its own.
+        # The command line takes one header, so each table is a run of its own.
         for frame, header in zip(frames, files["headers"], strict=True):
             given = "" if header is None else f" --wcs {header}"
             yield f"wpdc calibrate {frame}{given} --catalog {catalog} --output results"
@@ -301,7 +301,7 @@ def _epochs(text, n_exposures):
 
 
 def _centers(texts, fields, seed):
-    """Centers of the fields: those that are given, the rest spread over the sky."""
+    """Centers of the fields: the given ones, and random ones on the sky for the rest."""
     from astropy import units as u
     from astropy.coordinates import Angle, SkyCoord
 

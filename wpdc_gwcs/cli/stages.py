@@ -41,7 +41,7 @@ Table = Annotated[Path, typer.Option("--output", metavar="FILE", help="Table to 
 
 
 def one_frame(path, **options):
-    """Read the single frame of a file.
+    """Read a file with a single frame.
 
     Parameters
     ----------

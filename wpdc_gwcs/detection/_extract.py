@@ -113,7 +113,7 @@ def search(background, threshold, deblend_contrast, fwhm=0.0):
 
 
 def is_broad(fwhm):
-    """Tell whether stars of this FWHM in px need a broader filter.
+    """Return whether stars of this FWHM in px need a broader filter.
 
     Parameters
     ----------

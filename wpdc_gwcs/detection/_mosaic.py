@@ -49,7 +49,7 @@ def plane_slices(period):
 
 
 def has_pattern(data, bad, scatter):
-    """Tell whether the levels of an image repeat every 2 x 2 px.
+    """Return whether the levels of an image repeat every 2 x 2 px.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Residuals of frames, detectors and runs; comparison of radial weights; drift; the truth."""
+"""Residuals of frames, detectors and runs; radial weights; drift; comparison with a truth."""
 
 from wpdc_gwcs.evaluation.cuts import Cuts
 from wpdc_gwcs.evaluation.drift import Drift, detect_drift

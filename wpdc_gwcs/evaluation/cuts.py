@@ -1,4 +1,4 @@
-"""Limits on the stars, and on the part of a detector, for statistics."""
+"""Limits on stars and on the part of a detector, for statistics."""
 
 from dataclasses import dataclass
 
@@ -66,11 +66,11 @@ class Cuts:
                 raise ValueError(f"{name} must have its lower limit first, got {low:g} to {high:g}")
 
     def __bool__(self):
-        """Tell whether there is any limit."""
+        """Whether there is any limit."""
         return any(value is not None for value in vars(self).values())
 
     def place(self, x, y, crpix):
-        """Mark positions that are within the limits on them.
+        """Mark positions within the limits on position.
 
         Parameters
         ----------
@@ -82,7 +82,7 @@ class Cuts:
         Returns
         -------
         (N,) ndarray of bool
-            True for those within.
+            True for positions within.
         """
         x, y = np.asarray(x, float), np.asarray(y, float)
         inside = np.isfinite(x) & np.isfinite(y)
@@ -99,19 +99,19 @@ class Cuts:
         return inside
 
     def select(self, stars, crpix):
-        """Mark stars that are within all limits.
+        """Mark stars within all limits.
 
         Parameters
         ----------
         stars : `~astropy.table.Table`
-            Columns ``x``, ``y``, and ``phot_g_mean_mag`` and ``snr`` where these have limits.
+            Columns ``x``, ``y``, and ``phot_g_mean_mag`` and ``snr`` if these have limits.
         crpix : (float, float)
             Reference point, px, zero based.
 
         Returns
         -------
         (N,) ndarray of bool
-            True for those within; a magnitude or a ratio that is not known is not.
+            True for stars within; an unknown magnitude or ratio is outside any limit on it.
 
         Raises
         ------

@@ -3,7 +3,7 @@
 ::
 
     residuals --means in cells--> most significant cell, whole detector --> verdict
-        '--less the linear part of what has not changed--> cells that have changed, by how much
+        '--minus the linear part of the unchanged cells--> changed cells, size of the change
 """
 
 from collections.abc import Iterable
@@ -19,27 +19,27 @@ from wpdc_gwcs.robust import robust_scatter
 
 __all__ = ["Drift", "detect_drift", "mean_in_cells"]
 
-# Cells along each side of the detector in which a drift is looked for, and stars that a cell needs.
+# Cells along each side of the detector in the search for a drift; stars needed per cell.
 _GRIDS = (2, 4, 8, 16)
 _MIN_STARS = 8
 
 # Cells along each side for the test of the whole detector.
 _WHOLE_GRID = 8
 
-# The uncertainty of a table is itself an estimate: taken this much larger, so that a false alarm is
-# no more frequent than stated.
+# The uncertainty of a table is itself an estimate.  It is inflated by this factor, so that false
+# alarms are not more frequent than stated.
 _TABLE_MARGIN = 1.5
 
-# Stars per cell in the grid on which the linear part of what has not changed is found.
+# Stars per cell of the grid that is used to find the linear part of the unchanged cells.
 _LINEAR_STARS = 200
 
-# Chi-square (two axes) of a cell from which it no longer counts for it: 1 in 1000.
+# Chi-square (two axes) above which a cell is excluded from this fit: 1 in 1000.
 _CHANGED_CHI2 = 13.8
 
-# Probability of the differences within a cell from which it has changed as a whole.
+# A cell has changed as a whole if the differences within it are at least this probable.
 _UNIFORM = 1e-3
 
-# Smallest share of the cells that must be unchanged for their linear part to be the attitudes'.
+# Minimum fraction of unchanged cells for which their linear part is attributed to the attitudes.
 _UNCHANGED_SHARE = 0.5
 
 
@@ -59,7 +59,7 @@ class Drift:
         Root mean square of the change over the cells that have changed, both axes together, px; 0
         without drift.
     area : float
-        Share of the detector's stars that are in these cells.
+        Fraction of the stars that are in these cells.
     n_stars : int
         Stars tested.
     cells : `~astropy.table.QTable`
@@ -87,7 +87,7 @@ def detect_drift(solution, matches, *, false_alarm=0.01):
     solution : DistortionSolution
         The stored solution.
     matches : `~astropy.table.Table` or iterable of them
-        Match tables of frames that were calibrated with this solution, attitude only: columns
+        Match tables of frames that were calibrated with this solution (attitude only): columns
         ``x``, ``y``, ``dx``, ``dy``, ``x_err``, ``y_err`` in px.
     false_alarm : float, optional
         Accepted probability of reporting a change where there is none.
@@ -111,7 +111,7 @@ def detect_drift(solution, matches, *, false_alarm=0.01):
        frames of the solution did.
     2. The most significant cell, its probability multiplied by the number of cells (Bonferroni,
        which holds whatever the correlation between cells), and the chi-square of the whole
-       detector, with the correlation of the table's errors, have half of the false alarms each.
+       detector, which accounts for correlated errors of the table, share the false alarms equally.
     3. The attitudes of the frames have absorbed the linear part of a change.  It is found from the
        largest set of cells that agree on a linear map, by a robust fit from many starting points.
        It is subtracted, and cells are tested again: large cells that have changed as a whole, then
@@ -173,7 +173,7 @@ def mean_in_cells(solution, matches, n_grid):
     Parameters
     ----------
     solution : DistortionSolution
-        Of the detector.
+        Solution of the detector.
     matches : iterable of `~astropy.table.Table`
         As for `detect_drift`.
     n_grid : int
@@ -182,8 +182,8 @@ def mean_in_cells(solution, matches, n_grid):
     Returns
     -------
     `~astropy.table.Table`
-        A row for each cell with eight stars: ``x_min``, ``x_max``, ``y_min``, ``y_max``, ``n``,
-        ``dx``, ``dy``, ``sigma_dx``, ``sigma_dy``, in px.
+        One row per cell with eight or more stars: ``x_min``, ``x_max``, ``y_min``, ``y_max``,
+        ``n``, ``dx``, ``dy``, ``sigma_dx``, ``sigma_dy``, in px.
     """
     stars = _Stars(solution, [_columns_of(table) for table in matches])
     cells = stars.average(n_grid)
@@ -196,7 +196,7 @@ def mean_in_cells(solution, matches, n_grid):
 
 
 def _columns_of(table):
-    """Take position, residual and error of the valid stars of a frame, errors as the scatter is."""
+    """Positions, residuals and errors of the valid stars; errors are scaled to the scatter."""
     names = ("x", "y", "dx", "dy", "x_err", "y_err")
     columns = np.array([np.asarray(table[name], dtype=float) for name in names])
     columns = columns[:, np.isfinite(columns).all(axis=0) & (columns[4:] > 0).all(axis=0)]
@@ -229,11 +229,11 @@ class _Stars:
         return iy * n_grid + ix
 
     def average(self, n_grid, *, residual=None, use=None, inflation=None):
-        """Means in n_grid x n_grid cells: all residuals, or other ones of some of the stars."""
+        """Means in n_grid x n_grid cells, optionally of other residuals or of some of the stars."""
         residual = self.residual if residual is None else residual
         cell, m = self.cell(n_grid), n_grid**2
         rows = np.arange(len(cell)) if use is None else np.flatnonzero(use)
-        # A wrong pair must not speak for its cell; a change that is large must.
+        # A wrong pair must not dominate its cell, but a large change must count.
         center = np.array([median(r[rows], cell[rows], np.arange(m)) for r in residual])
         near = np.abs(residual[:, rows] - center[:, cell[rows]]) < 5 * self.sigma[:, rows]
         rows = rows[near.all(axis=0)]
@@ -254,11 +254,11 @@ class _Stars:
         )
 
     def _known(self, n_grid):
-        """Variances of the means of all cells, (2, cells), that the solution is uncertain by.
+        """Variances of the cell means due to the uncertainty of the solution, (2, cells).
 
-        A smoother of p parameters is wrong by its mean variance where it is asked at a point, and
-        by at most the share cells / p of that in the mean over a cell: the squared means of p
-        orthonormal functions over a cell add up to at most the number of cells.
+        A smoother with p parameters has its mean variance at a point, and at most the fraction
+        cells / p of that in the mean over a cell: the squared means of p orthonormal functions
+        over a cell add up to at most the number of cells.
         """
         ny, nx = self.solution.image_shape
         m = 3 * n_grid
@@ -270,14 +270,14 @@ class _Stars:
         share = min(1.0, n_grid**2 / freedom) if freedom else 1.0
         variance = variance * share
         if self.n_frames == 1:
-            # Several frames show by their differences what is their own.
+            # With several frames, their differences show the variance of single frames.
             variance = variance + _field_variance(self.solution)
         return variance * _TABLE_MARGIN**2
 
     def _inflation(self, cell, rows, residual, weight, mean, m):
-        """How much more the means of frames scatter than the errors of their stars, at least 1.
+        """Ratio (at least 1) of the scatter of frame means to that expected from star errors.
 
-        The attitude of a frame takes three of the means of each axis.
+        The attitude of a frame absorbs three of the means along each axis.
         """
         if self.n_frames < 2 or m <= 4:
             return 1.0
@@ -295,9 +295,9 @@ class _Stars:
 
 
 def _field_variance(solution):
-    """Variance along each axis that a frame of itself brings, what attitudes take left out, px^2.
+    """Variance per axis of the field of a single frame beyond its attitude, px^2.
 
-    A von Karman spectrum, without the waves that are longer than the detector.
+    From a von Karman spectrum, without waves longer than the detector.
     """
     fields = solution.statistics.get("fields")
     if not fields:
@@ -308,7 +308,7 @@ def _field_variance(solution):
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Means of the cells of a grid that have enough stars, and their variances (2, M)."""
+    """Means in the cells of a grid with enough stars, and their variances (2, M)."""
 
     index: np.ndarray
     n: np.ndarray
@@ -318,7 +318,7 @@ class _Cells:
     inflation: float
 
     def take(self, mask):
-        """Keep some of the cells."""
+        """Select some of the cells."""
         return _Cells(
             self.index[mask], self.n[mask], self.mean[:, mask], self.noise[:, mask],
             self.known[:, mask], self.inflation,
@@ -341,8 +341,8 @@ class _Cells:
 def _whole(solution, grids):
     """Probability of the chi-square of all cells together.
 
-    The errors of the table are common to neighboring cells: they have no more independent values
-    than the table has parameters, and the chi-square scatters the more.
+    Neighboring cells share the errors of the table.  These have no more independent values than
+    the table has parameters, so the chi-square scatters more.
     """
     cells = grids[_WHOLE_GRID]
     n = len(cells.index)
@@ -361,10 +361,10 @@ def _whole(solution, grids):
 
 
 def _localize(stars, grids, limit):
-    """Cells that have changed, without the linear part that the attitudes have taken.
+    """Find the changed cells, after subtraction of the linear part that attitudes absorb.
 
-    First large cells that have changed as a whole, then small ones, then what is left of larger
-    ones.  Returns (grid, cells, which have changed) and the stars in those.
+    First large cells that have changed as a whole, then small ones, then the rest of larger ones.
+    Returns (grid, cells, mask of changed cells) and the stars in those.
     """
     linear = _unchanged_linear(grids)
     ny, nx = stars.solution.image_shape
@@ -390,7 +390,7 @@ def _localize(stars, grids, limit):
         parts.append((n_grid, cells, changed))
         gone |= np.isin(stars.cell(n_grid), cells.index[changed])
     if not gone.any():
-        # Significant together, none by itself: what stands out before is all there is to show.
+        # Significant together, but no cell by itself: report the cells found so far.
         best = min(g.p_value.min(initial=1.0) for g in grids.values())
         parts = [(n, g, g.p_value == best) for n, g in grids.items()]
         for n_grid, cells, changed in parts:
@@ -413,8 +413,8 @@ def _uniform(n_grid, cells, finer):
 
 
 def _unchanged_linear(grids):
-    """Linear part (2, 3) of the cells that have not changed: the most that agree on one."""
-    # A cell must show a change by itself.
+    """Linear part (2, 3) of the unchanged cells: the largest set that agrees on one."""
+    # Only cells that show a change by themselves are excluded.
     good = [n for n, g in grids.items() if len(g.index) >= 9 and np.median(g.n) >= _LINEAR_STARS]
     if not good:
         return np.zeros((2, 3))
@@ -443,7 +443,7 @@ def _unchanged_linear(grids):
 
 
 def _starts(u, v):
-    """Parts of the detector to begin with: all, without a quarter of any kind, halves, the ring."""
+    """Parts of the detector to start from: all, all but a quarter, halves, the outer ring."""
     yield np.ones(u.size, bool)
     for a, b in ((u, v), (-v, u), (-u, -v), (v, -u)):
         yield ~((a > 0) & (b > 0))
@@ -457,7 +457,7 @@ def _starts(u, v):
 
 
 def _amplitude(parts):
-    """Root mean square of the change over the changed cells, less what noise adds."""
+    """Root mean square of the change over the changed cells, minus the noise."""
     n = np.concatenate([cells.n[changed] for _, cells, changed in parts])
     square = np.concatenate(
         [np.sum(cells.mean**2 - cells.noise, axis=0)[changed] for _, cells, changed in parts]

@@ -15,11 +15,11 @@ from wpdc_gwcs.evaluation.residuals import evaluate
 
 __all__ = ["DriftHistory", "residuals_of_attitude", "split_periods", "track_drift"]
 
-# Cells along each side whose means are followed: small enough to tell where, large enough that a
-# night has stars in each.
+# Cells along each side whose means are tracked: small enough to locate a change, large enough to
+# have stars every night.
 _GRID = 4
 _DAYS_PER_YEAR = 365.25
-# Stars that tell the six numbers of an attitude, and something beyond.
+# Minimum number of stars to fit the six numbers of an attitude and have some to spare.
 _LEAST_STARS = 8
 
 
@@ -35,11 +35,11 @@ class DriftHistory:
         Shape ``(ny, nx)`` in px.
     periods : `~astropy.table.QTable`
         One row for each period: ``first_epoch``, ``last_epoch`` (Julian years), ``n_frames``,
-        ``n_stars``, clipped ``mean_dx``, ``sigma_dx``, ``mean_dy``, ``sigma_dy`` (px), and of
-        `detect_drift` ``p_value``, ``drifted``, ``amplitude`` (px) and ``area``; a period of too
-        few stars has no ``p_value``.
+        ``n_stars``, clipped ``mean_dx``, ``sigma_dx``, ``mean_dy``, ``sigma_dy`` (px), and from
+        `detect_drift` ``p_value``, ``drifted``, ``amplitude`` (px) and ``area``; ``p_value`` is NaN
+        for a period with too few stars.
     cells : `~astropy.table.QTable`
-        For each period the means in 4 x 4 cells: ``period`` (row of the other table), ``x_min``,
+        Means in 4 x 4 cells for each period: ``period`` (row of ``periods``), ``x_min``,
         ``x_max``, ``y_min``, ``y_max``, ``n``, ``dx``, ``dy``, ``sigma_dx``, ``sigma_dy`` (px).
     """
 
@@ -55,7 +55,7 @@ class DriftHistory:
 
 
 def split_periods(epochs, days):
-    """Group frames by period.
+    """Group frames into periods of equal length.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def split_periods(epochs, days):
     Returns
     -------
     list of (M,) ndarray of int
-        Indices of the frames of each period that has any, in order of time.
+        Indices of the frames of each period that is not empty, in order of time.
 
     Raises
     ------
@@ -87,27 +87,27 @@ def split_periods(epochs, days):
         raise ValueError(f"days must be positive, got {days}")
     if not epochs.size:
         return []
-    # Epochs have a grain of microseconds.
+    # Rounding of epochs: microseconds.
     number = np.floor((epochs - epochs.min()) * _DAYS_PER_YEAR / days + 1e-9).astype(int)
     order = np.argsort(epochs, kind="stable")
     return [order[number[order] == k] for k in np.unique(number)]
 
 
 def residuals_of_attitude(calibration, matches):
-    """Return the residuals that a frame would have without its field.
+    """Return the residuals that a frame would have without its own field.
 
     Parameters
     ----------
     calibration : Calibration
-        Of the frame.
+        Calibration of the frame.
     matches : `~astropy.table.Table`
         Its matches.
 
     Returns
     -------
     `~astropy.table.Table`
-        The same, or a copy with the field added back to ``dx`` and ``dy``, without the linear part
-        that an attitude absorbs, because a field also absorbs a drift.
+        The matches, or a copy with the field added back to ``dx`` and ``dy`` without its linear
+        part, which the attitude absorbs.  This is needed because a field also absorbs a drift.
     """
     if calibration.field is None:
         return matches
@@ -129,23 +129,23 @@ def residuals_of_attitude(calibration, matches):
 
 
 def track_drift(solution, periods, *, false_alarm=0.01):
-    """Follow a stored solution over time.
+    """Test a stored solution over time, period by period.
 
     Parameters
     ----------
     solution : DistortionSolution
         The stored solution.
     periods : iterable of (epochs, matches)
-        Epochs of the frames of a period, Julian years or NaN, and their match tables as for
-        `detect_drift`; they are used one by one and not kept.
+        Epochs of the frames of a period (Julian years or NaN), and their match tables as for
+        `detect_drift`.  Periods are processed one by one and not kept.
     false_alarm : float, optional
-        Accepted probability of an alarm in a period without a change; for many periods, give a
-        share of the total.
+        Accepted probability of an alarm in a period without a change; for many periods, divide
+        the total by their number.
 
     Returns
     -------
     DriftHistory
-        A row for each period.
+        One row per period.
 
     Raises
     ------

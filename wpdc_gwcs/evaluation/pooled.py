@@ -1,4 +1,4 @@
-"""Residuals of all frames of a detector, and of a run, taken together.
+"""Pooled residuals of all frames of a detector, and of a run.
 
 ::
 
@@ -24,7 +24,7 @@ __all__ = ["DetectorResiduals", "format_table", "pool_residuals", "tabulate_dete
 # Name of the row of a whole run.
 _ALL = "all"
 _MAS = 3.6e6  # per deg
-# The columns of the paper's table 2 and what they are there.
+# Columns of table 2 of the paper and their names there.
 _PAPER = {
     "mean_dx": r"$\mu_{\delta x}$",
     "sigma_dx": r"$\sigma_{\delta x}$",
@@ -35,7 +35,7 @@ _PAPER = {
 
 @dataclass(frozen=True, eq=False)
 class DetectorResiduals:
-    """Residuals of the stars of all frames of a detector.
+    """Pooled residuals of all frames of a detector.
 
     Parameters
     ----------
@@ -50,14 +50,14 @@ class DetectorResiduals:
     dx, dy : (N,) ndarray
         Residuals in px.
     d_alpha, d_delta : (N,) ndarray
-        The same on the sky, measured minus reference, east and north, in mas.
+        Residuals on the sky, measured minus reference, east and north, in mas.
     statistics : ResidualStatistics
-        Of the residuals in px.
+        Statistics of the residuals in px.
     mean_alpha, sigma_alpha, mean_delta, sigma_delta : float
         Moments on the sky after clipping, mas.
     share_below : float
-        Share of the area, of the cells that have stars, whose mean residual is shorter than the
-        limit; of a run the mean over its detectors.
+        Fraction of the area (cells with stars) whose mean residual is shorter than the limit; for a
+        run, the mean over its detectors.
     limit : float
         The limit, px.
     """
@@ -81,31 +81,31 @@ class DetectorResiduals:
 
 
 def pool_residuals(calibrations, *, cuts=None, stars="used", limit=0.01, n_bins=20):
-    """Pool the residuals of calibrated frames, detector by detector, and of all of them.
+    """Pool the residuals of calibrated frames by detector, and over all detectors.
 
     Parameters
     ----------
     calibrations : Calibration or iterable of them
         Calibrated frames with their ``matches``.
     cuts : Cuts, optional
-        Limits on the stars; distances count from the reference point of the frame's solution.
+        Limits on the stars; distances are from the reference point of the frame's solution.
     stars : {"used", "holdout"}, optional
-        Which stars: those in the fit, or those kept out of it.
+        Stars in the fit, or stars held out of it.
     limit : float, optional
-        Length of a mean residual, px, below which a part of the area is counted; the paper's 0.01.
+        Limit of the mean residual for ``share_below``, px; the paper uses 0.01.
     n_bins : int, optional
         Cells of the area along each axis; the paper shows 20 x 20.
 
     Returns
     -------
     list of DetectorResiduals
-        One for each detector that has such stars, in the order of their names; last, where there
-        are several, one of all.
+        One for each detector with such stars, sorted by name; if there are several, the last one
+        is for all.
 
     Raises
     ------
     ValueError
-        If the frames have no matches, or an argument is impossible.
+        If the frames have no matches, or an argument is invalid.
 
     Notes
     -----
@@ -173,7 +173,7 @@ def _pooled(detector, n_frames, stars, columns, image_shape, limit, n_bins, shar
 
 
 def tabulate_detectors(residuals):
-    """Put the statistics of detectors into a table.
+    """Tabulate the statistics of detectors.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def tabulate_detectors(residuals):
 
 
 def format_table(residuals, *, form="ascii"):
-    """Write the table of detectors like table 2 of the paper.
+    """Format the table of detectors like table 2 of the paper.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def format_table(residuals, *, form="ascii"):
     Raises
     ------
     ValueError
-        If the form is another.
+        If `form` is neither.
 
     References
     ----------
@@ -229,7 +229,7 @@ def format_table(residuals, *, form="ascii"):
     if form not in ("ascii", "latex"):
         raise ValueError(f"form must be 'ascii' or 'latex', got {form!r}")
     rows = [
-        # Adding zero takes the sign from what is rounded to nothing.
+        # Adding zero removes the sign of a value that is rounded to zero.
         (r.detector, [f"{round(getattr(r.statistics, name), 3) + 0.0:.3f}" for name in _PAPER])
         for r in residuals
         if r.detector != _ALL or len(residuals) == 1

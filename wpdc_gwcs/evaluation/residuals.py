@@ -54,7 +54,7 @@ class ResidualStatistics:
 
 
 def d80(values):
-    """Width between the 20 % and 80 % levels of the cumulative distribution.
+    """Return the width between the 20 % and 80 % levels of the cumulative distribution.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def d80(values):
 
 
 def evaluate(dx, dy, *, sigma=3.0):
-    """Statistics of the residuals of matched stars.
+    """Compute statistics of the residuals of matched stars.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def evaluate(dx, dy, *, sigma=3.0):
     Returns
     -------
     ResidualStatistics
-        All NaN, with ``n = 0``, where there are no stars.
+        All NaN, with ``n = 0``, if there are no stars.
 
     Examples
     --------
@@ -134,7 +134,7 @@ def evaluate(dx, dy, *, sigma=3.0):
 
 
 def within_sigma(dx, dy, *, sigma=3.0):
-    """Mark the residuals that a clipping leaves.
+    """Mark the residuals that survive sigma clipping.
 
     Parameters
     ----------
@@ -146,14 +146,14 @@ def within_sigma(dx, dy, *, sigma=3.0):
     Returns
     -------
     (N,) ndarray of bool
-        True for those that neither axis clips.
+        True for stars that are clipped on neither axis.
     """
     clip = SigmaClip(sigma=sigma, maxiters=None)
     return ~(np.ma.getmaskarray(clip(dx)) | np.ma.getmaskarray(clip(dy)))
 
 
 def binned_residuals(x, y, dx, dy, *, image_shape, n_bins=20):
-    """Mean residuals in the cells of a grid over the detector.
+    """Average residuals in the cells of a grid over the detector.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def binned_residuals(x, y, dx, dy, *, image_shape, n_bins=20):
     Returns
     -------
     mean_dx, mean_dy : (n_bins, n_bins) `numpy.ndarray`
-        Means in px, indexed ``[iy, ix]``, NaN where a cell has no star.
+        Means in px, indexed ``[iy, ix]``, NaN for empty cells.
     count : (n_bins, n_bins) `numpy.ndarray` of int
         Stars in each cell.
 
@@ -202,16 +202,16 @@ def binned_residuals(x, y, dx, dy, *, image_shape, n_bins=20):
 
 
 def running_statistics(values, dx, dy, *, n_bins=10):
-    """Statistics of the residuals against anything: magnitude, signal to noise, position.
+    """Compute statistics of the residuals in bins of any quantity, such as magnitude.
 
     Parameters
     ----------
     values : (N,) array_like
-        What the residuals are put in order by; stars without a finite value are left out.
+        Quantity to bin by; stars without a finite value are left out.
     dx, dy : (N,) array_like
         Residuals in px.
     n_bins : int, optional
-        Number of equally filled bins; fewer where a bin would have fewer than 10 stars.
+        Number of equally filled bins; fewer if a bin would have fewer than 10 stars.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Calibrations held against the truth of a simulation.
+"""Calibrations compared with the truth of a simulation.
 
 ::
 
@@ -17,8 +17,8 @@ from wpdc_gwcs.evaluation.cuts import Cuts
 __all__ = ["TruthScore", "pool_scores", "score_frame", "tabulate_scores"]
 
 _ALL = "all"
-# A pair is wrong if its star is not the one that the list's source is.  Of an image there is no
-# such list: wrong is what is further from its star than centroids are off, in errors and px.
+# For a source list, a pair is wrong if its star is not the star of the source.  For an image, it is
+# wrong if the source is further from its star than these limits, in errors and in px.
 _FAR_SIGMA, _FAR_PX = 5.0, 1.0
 
 
@@ -37,21 +37,21 @@ class TruthScore:
     wcs_rms : float
         Root mean square of the length of the WCS's error over the detector, px.
     wcs_mean_dx, wcs_mean_dy : float
-        Its mean along both axes, px.
+        Mean of the error along both axes, px.
     wcs_p95, wcs_max : float
-        Its 95th percentile and its greatest length, px.
+        95th percentile and maximum of the length of the error, px.
     wcs_rms_static : float
         Root mean square of the error common to all frames of the detector, px.
     wcs_rms_stars : float
         Root mean square of the error at the stars of the fit, px.
     share_below : float
-        Share of the area where the error is shorter than the limit.
+        Fraction of the area where the error is shorter than the limit.
     limit : float
         The limit, px.
     n_matched, n_wrong : int
-        Number of pairs, and of wrong ones among them.
+        Number of pairs, and of wrong pairs.
     n_used, n_wrong_used : int
-        The same of those in the fit.
+        The same for pairs in the fit.
     pull_wcs : float
         Ratio of the error of the WCS to its stated uncertainty, root mean square per axis; 1 is
         correct.
@@ -84,21 +84,21 @@ class TruthScore:
 
 
 def score_frame(calibration, truth, stars, *, cuts=None, limit=0.01, n_grid=101):
-    """Score a calibrated frame.
+    """Compare a calibrated frame with the truth.
 
     Parameters
     ----------
     calibration : Calibration
         The calibrated frame, with its ``matches``.
     truth : FrameTruth
-        The truth about it.
+        Truth of the frame.
     stars : `~astropy.table.Table`
-        The truth star by star, see `wpdc_gwcs.simulation.read_truth`: columns ``x``, ``y``,
-        ``catalog_index`` and, of a source list, ``source_index``.
+        Truth of the stars, see `wpdc_gwcs.simulation.read_truth`: columns ``x``, ``y``,
+        ``catalog_index`` and, for a source list, ``source_index``.
     cuts : Cuts, optional
-        Limits on the area, and on the stars.
+        Limits on the area and on the stars.
     limit : float, optional
-        Length of an error, px, below which a part of the area is counted.
+        Limit of the error for ``share_below``, px.
     n_grid : int, optional
         Points of the grid along each axis, from edge to edge of the detector.
 
@@ -162,7 +162,7 @@ def score_frame(calibration, truth, stars, *, cuts=None, limit=0.01, n_grid=101)
 
 
 def _true_stars(matches, stars):
-    """Row of each pair's star in the truth, -1 where it has none, and whether the pair is wrong."""
+    """Row of each pair's star in the truth (-1 for none), and whether the pair is wrong."""
     catalog = np.asarray(matches["catalog_index"], int)
     row_of = _rows(stars["catalog_index"], catalog.max(initial=0) + 1)
     star = row_of[catalog]
@@ -178,7 +178,7 @@ def _true_stars(matches, stars):
 
 
 def _rows(index, size):
-    """Row of the truth for each index of a list or catalog, -1 where there is none."""
+    """Row of the truth for each index of a list or catalog, -1 for none."""
     index = np.asarray(index, int)
     known = np.flatnonzero((index >= 0) & (index < size))
     rows = np.full(size, -1)
@@ -211,18 +211,18 @@ def _moments(error, limit):
 
 
 def pool_scores(scores):
-    """Pool the scores of frames, detector by detector, and of all of them.
+    """Pool the scores of frames by detector, and over all detectors.
 
     Parameters
     ----------
     scores : sequence of TruthScore
-        Scores of frames, with one limit.
+        Scores of frames, all with the same limit.
 
     Returns
     -------
     list of TruthScore
-        One for each detector, in the order of their names; last, where there are several, one of
-        all.  The errors on the grid are the means over the frames.
+        One for each detector, sorted by name; if there are several, the last one is for all.  The
+        errors on the grid are means over the frames.
 
     Raises
     ------
@@ -274,17 +274,17 @@ def _pool(group, detector, static=None):
 
 
 def tabulate_scores(scores):
-    """Put scores into a table.
+    """Tabulate scores.
 
     Parameters
     ----------
     scores : sequence of TruthScore
-        Of frames, or pooled.
+        Scores of frames, or pooled ones.
 
     Returns
     -------
     `~astropy.table.QTable`
-        One row each: all fields of `TruthScore` but the errors on the grid.
+        One row each, with all fields of `TruthScore` except the errors on the grid.
     """
     return QTable(
         [{k: v for k, v in vars(s).items() if k not in ("error_x", "error_y")} for s in scores]

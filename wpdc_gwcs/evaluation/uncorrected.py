@@ -1,4 +1,4 @@
-"""Residuals before a calibration: what the linear WCS alone would leave."""
+"""Residuals before a calibration: those of the linear WCS alone."""
 
 import numpy as np
 from astropy.table import Table
@@ -9,18 +9,18 @@ __all__ = ["uncorrected_residuals"]
 
 
 def uncorrected_residuals(calibration):
-    """Return the residuals of a frame without polynomial and table.
+    """Return the residuals of a frame without its polynomial and table.
 
     Parameters
     ----------
     calibration : Calibration
-        With its ``matches``.
+        Calibration with ``matches``.
 
     Returns
     -------
     `~astropy.table.Table`
-        The matches, with ``dx`` and ``dy``, px, those of the measured pixels: x - X_ref and
-        y - Y_ref in the linear WCS of the frame.
+        The matches, with ``dx`` and ``dy`` (px) replaced by x - X_ref and y - Y_ref of the measured
+        pixels in the linear WCS of the frame.
 
     Raises
     ------

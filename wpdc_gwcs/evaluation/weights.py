@@ -1,4 +1,4 @@
-"""The five radial weights side by side: what the solution would be with each of them.
+"""Comparison of the five radial weights: the solution with each of them.
 
 ::
 
@@ -36,9 +36,9 @@ class WeightResult:
     table_dx, table_dy : (N,) ndarray
         Residuals with a look-up table for the residuals of this polynomial, px.
     statistics, table_statistics : ResidualStatistics
-        Of the former and of the latter.
+        Statistics of the former and of the latter.
     held_out : bool
-        Whether the residuals are those of held-out stars; if not, of the stars in the fit.
+        Whether the residuals are of held-out stars; otherwise of the stars in the fit.
     x, y : (N,) ndarray, optional
         Pixels of the stars, zero based.
     distance : (N,) ndarray, optional
@@ -68,12 +68,12 @@ class WeightResult:
         Returns
         -------
         WeightResult
-            Of these stars alone.
+            Result for these stars alone.
 
         Raises
         ------
         ValueError
-            If the distances of the stars are not known, or no star is as near.
+            If the distances of the stars are unknown, or no star is that near.
         """
         near = None if self.distance is None else self.distance <= radius
         if near is None or not near.any():
@@ -86,12 +86,12 @@ class WeightResult:
         Parameters
         ----------
         chosen : (N,) ndarray of bool
-            Which.
+            Mask of the stars.
 
         Returns
         -------
         WeightResult
-            Of these stars alone.
+            Result for these stars alone.
         """
         columns = ("dx", "dy", "table_dx", "table_dy", "x", "y", "distance")
         arrays = {name: getattr(self, name)[chosen] for name in columns}
@@ -115,16 +115,16 @@ def compare_weights(calibrations, *, weights=RadialWeight.names, r0=None, degree
     weights : sequence of str, optional
         Names of the weights.
     r0 : float, optional
-        Radius within which all stars weigh the same, px; that of the solution's settings, or 0.87
-        times half the shorter side, if not given.
+        Radius within which all stars have the same weight, px; by default that of the solution's
+        settings, or else 0.87 times half the shorter side.
     degree : int, optional
         Degree of the polynomial.
 
     Returns
     -------
     list of WeightResult
-        One for each weight, in the order of the names.  The residuals are those of the held-out
-        stars where there are any.
+        One for each weight, in the order of the names.  The residuals are those of held-out stars
+        if there are any.
 
     Raises
     ------
@@ -135,9 +135,8 @@ def compare_weights(calibrations, *, weights=RadialWeight.names, r0=None, degree
 
     Notes
     -----
-    The attitudes of the frames are kept, and a linear part that all of them share is free.  Tables
-    are made as those of ``build_lookup_table(draft=True)``: one kernel, its smoothing by
-    generalized cross-validation.
+    The attitudes of the frames are kept, except for a common linear part.  Tables are built as by
+    ``build_lookup_table(draft=True)``, with one kernel smoothed by generalized cross-validation.
 
     References
     ----------
@@ -218,7 +217,7 @@ def compare_weights(calibrations, *, weights=RadialWeight.names, r0=None, degree
 
 
 def _stars_of(calibration):
-    """Offsets, reference positions and errors of a frame's stars, px, and which are in the fit."""
+    """Offsets, reference positions and errors of the stars of a frame (px), and the fit mask."""
     m, s = calibration.matches, calibration.solution
     columns = {
         name: np.asarray(m[name], dtype=float) for name in ("x", "y", "x_err", "y_err", "ra", "dec")
@@ -235,7 +234,7 @@ def _stars_of(calibration):
 
 
 def tabulate_weights(results):
-    """Statistics of the residuals with each weight, without and with a table.
+    """Tabulate the residuals with each weight, without and with a look-up table.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ def cpdis_form(obj, *, first_version=1):
     tables : list of `~astropy.io.fits.ImageHDU`
         ``WCSDVARR``; none where there is no look-up table.
     deviation : float
-        Greatest deviation from the exact WCS, px.
+        Largest deviation from the exact WCS, px.
 
     Notes
     -----

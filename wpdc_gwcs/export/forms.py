@@ -44,14 +44,14 @@ class FitsForm:
     tables : tuple of HDU
         Extensions that readers of the form need.
     deviation : float or None
-        Greatest deviation from the exact WCS over the detector for these readers, px; `None` where
+        Largest deviation from the exact WCS over the detector for these readers, px; `None` where
         it is exact, or where the shape of the detector is unknown.
     keywords_deviation : float or None
         For ``fits``: the same for readers of the keywords alone.
     inverse_deviation : float or None
-        For ``sip``: greatest deviation of the inverse polynomials, px.
+        For ``sip``: largest deviation of the inverse polynomials, px.
     swarp_deviation : float or None
-        For ``tpv`` and ``head``: greatest deviation in SWarp, whose way from sky to pixel is not
+        For ``tpv`` and ``head``: largest deviation in SWarp, whose way from sky to pixel is not
         exact, px.
     written : Calibration or DistortionSolution or None
         For ``fits`` and ``cpdis``: the same mapping with the polynomial that the keywords have.

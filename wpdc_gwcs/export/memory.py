@@ -31,7 +31,7 @@ class InMemory:
         Returns
         -------
         header : `~astropy.io.fits.Header`
-            With NAXIS1 and NAXIS2; its card ``WPDCDEV`` has the greatest deviation from the exact
+            With NAXIS1 and NAXIS2; its card ``WPDCDEV`` has the largest deviation from the exact
             WCS, px.
 
         Raises
@@ -51,7 +51,7 @@ class InMemory:
             header["NAXIS2"] = (int(shape[0]), "[pixel] height of the detector")
         header.extend(made.header, end=True)
         if made.deviation is not None:
-            header["WPDCDEV"] = (made.deviation, "[pixel] greatest deviation")
+            header["WPDCDEV"] = (made.deviation, "[pixel] largest deviation")
         return header
 
     def to_astropy_wcs(self, format="tpv", *, degree=None):

@@ -33,9 +33,9 @@ def sip_keywords(obj, degree=None):
     header : `~astropy.io.fits.Header`
         The keywords.
     deviation : float
-        Greatest deviation from the exact WCS, px.
+        Largest deviation from the exact WCS, px.
     inverse_deviation : float
-        Greatest deviation of the inverse polynomials (AP, BP) from the inverse, px.
+        Largest deviation of the inverse polynomials (AP, BP) from the inverse, px.
 
     Raises
     ------

@@ -39,7 +39,7 @@ def step_errors(pv, u, plane):
     Returns
     -------
     errors : (2, N) ndarray or None
-        Where they end less where they should, deg; `None` where SWarp would not make them.
+        Where they end less where they should, deg; `None` if SWarp would not make them.
     """
     errors = _steps(pv, plane) - u
     return None if np.abs(errors).max(initial=0.0) > _MOST_DEG else errors

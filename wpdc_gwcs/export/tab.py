@@ -32,7 +32,7 @@ def tab_form(obj, *, version=1):
     tables : list of `~astropy.io.fits.BinTableHDU`
         The table.
     deviation : float
-        Greatest deviation from the exact WCS, px.
+        Largest deviation from the exact WCS, px.
 
     Notes
     -----

@@ -42,7 +42,7 @@ class TpvFit(NamedTuple):
     """TPV that is near to a mapping.
 
     ``crpix`` (px, zero based), ``cd`` (deg / px), the polynomial ``pv`` behind them, and the
-    greatest deviation from the exact WCS in px: ``deviation`` for readers that do as the keywords
+    largest deviation from the exact WCS in px: ``deviation`` for readers that do as the keywords
     say, ``swarp_deviation`` for SWarp, which goes from sky to pixel by three steps.  `None` where
     the shape of the detector is unknown, or the way of SWarp.
     """
@@ -162,7 +162,7 @@ def nearest_polynomial(obj, degree=None):
     pv : PVPolynomial
         In the matrix of the exposure.
     deviation : float or None
-        Greatest deviation from the exact WCS, px; `None` where the shape of the detector is
+        Largest deviation from the exact WCS, px; `None` if the shape of the detector is
         unknown.
 
     Raises

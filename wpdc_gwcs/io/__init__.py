@@ -1,4 +1,4 @@
-"""Files, and nothing else: frames, headers, calibrations, solutions and tables in and out.
+"""Reading and writing of frames, headers, calibrations, solutions and tables.
 
 ::
 

@@ -1,4 +1,4 @@
-"""The WCS of any file as a calibration: read as it is if possible, otherwise fitted.
+"""The WCS of any file as a calibration: exact if possible, otherwise fitted.
 
 ::
 
@@ -35,7 +35,7 @@ from wpdc_gwcs.io.tan import parse_tan
 
 __all__ = ["read_any"]
 
-# Where the ASDF tree of a telescope's pipeline stands in its FITS files.
+# Extension in which pipelines of telescopes store an ASDF tree in FITS files.
 _ASDF_EXTENSION = "ASDF"
 
 
@@ -49,12 +49,12 @@ def read_any(path, *, image_shape=None):
         of any kind, or with the tree of a pipeline in an extension ``ASDF``; ``.head`` or other
         text header.
     image_shape : (int, int), optional
-        Shape of the image, (ny, nx); needed where the file does not tell.
+        Shape of the image, (ny, nx); needed if the file does not tell.
 
     Returns
     -------
     obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
-        What a file of this package holds, and TAN and TPV headers, exactly; for the rest see
+        Exact for files of this package and for TAN and TPV headers; for others see
         `wpdc_gwcs.fit_wcs`.
 
     Raises
@@ -66,7 +66,7 @@ def read_any(path, *, image_shape=None):
     if file_kind(plain) == "asdf":
         if extension is not None:
             raise FileFormatError(f"{path}: only FITS and text files have extensions")
-        # Absolute, since a leading '~' is not a name to asdf, even if the file is open.
+        # Absolute, since a leading '~' is special to asdf, even if the file is open.
         with open(plain.absolute(), "rb") as file:
             tree = _read_tree(file, plain)
         if "wpdc" in tree:
@@ -116,7 +116,7 @@ def _fit(wcs, path, image_shape):
 def _read_tree(file, name):
     load_extensions()
     with warnings.catch_warnings():
-        # Tags of packages that are not installed: what they stand for is not asked for.
+        # Warnings about tags of packages that are not installed do not matter here.
         warnings.simplefilter("ignore")
         try:
             check_size(file, name)
@@ -127,7 +127,7 @@ def _read_tree(file, name):
 
 
 def _find_wcs(tree, name):
-    """Find the one WCS that stands nearest to the root of a tree."""
+    """Find the single WCS nearest to the root of a tree."""
     level = [("", tree)]
     seen = set()
     while level:
@@ -150,7 +150,7 @@ def _find_wcs(tree, name):
 
 
 def _children(node):
-    data = getattr(node, "data", node)  # nodes of tags that nobody knows
+    data = getattr(node, "data", node)  # nodes with unknown tags
     if hasattr(data, "items"):
         return list(data.items())
     if isinstance(data, list | tuple):

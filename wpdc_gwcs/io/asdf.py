@@ -1,4 +1,4 @@
-"""Calibrations and solutions as ASDF: a stock gwcs for everyone, a plain tree for an exact return.
+"""Calibrations and solutions as ASDF: a stock gwcs for everyone, and an exact plain tree.
 
 ::
 
@@ -25,8 +25,8 @@ Layout of ``wpdc``, format version 1.2.0 (arrays are core ASDF arrays, all else 
 only), ``statistics``, ``settings``, ``provenance``, ``valid_from``, ``valid_to``.  A camera has no
 ``wcs``; it has ``name``, ``detectors``, ``reference``, ``places``, ``matrices``, ``image_shapes``,
 ``cd``, ``learned``, ``files`` (detector to solution file beside it) and ``provenance``.  Matches
-and sources have tables of their own.  Files of version 1.0.0 open; the uncertainties of their
-frames are not known any more.  Those before 1.2.0 have no ``content_sum``.
+and sources are in separate tables.  Files of version 1.0.0 can be read, but without the
+uncertainties of frames.  Files before 1.2.0 have no ``content_sum``.
 """
 
 import dataclasses
@@ -60,11 +60,11 @@ __all__ = [
     "write_tree",
 ]
 
-# Tables with files of their own, and what only the file of the detector itself needs.
+# Fields that have their own files, and fields that only the file of the detector has.
 _NOT_STORED = {"matches", "sources"}
 _NOT_IN_FRAMES = {"residual_map"}
 _FIRST_WITH_SUM = (1, 2)
-# Arrays of up to so many values stand in the tree, where they are legible: CRPIX, CD, a cubic.
+# Arrays up to this size are written as text, where they can be read: CRPIX, CD, a cubic.
 _INLINE_VALUES = 20
 
 
@@ -74,7 +74,7 @@ def write_asdf(obj, path, *, overwrite=False):
     Parameters
     ----------
     obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or `~wpdc_gwcs.Camera`
-        What to write; of a camera not the solutions, which have files of their own.
+        Object to write; the solutions of a camera are not included, they have their own files.
     path : path-like
         File to write.
     overwrite : bool, optional
@@ -121,7 +121,7 @@ def write_stock(obj, path, *, overwrite=False):
     Returns
     -------
     deviation : float
-        Its greatest deviation from the exact WCS, px; `None` if the shape of the detector is
+        Its largest deviation from the exact WCS, px; `None` if the shape of the detector is
         unknown.
     """
     from wpdc_gwcs.export import deviation
@@ -134,7 +134,7 @@ def write_stock(obj, path, *, overwrite=False):
 
 
 def sum_of(obj):
-    """Sum over all that is in a result.
+    """Compute the checksum of the content of a result.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def _summed(tree):
 
 
 def _check_content(tree, version, path):
-    """Make sure that the values are those that were written; blocks have sums of their own."""
+    """Verify the checksum of the values; blocks have their own checksums."""
     given = tree.pop("content_sum", None)
     if given is None and version < _FIRST_WITH_SUM:
         return
@@ -252,11 +252,10 @@ def _check_content(tree, version, path):
 
 
 class _Unchecked(Extension):
-    """The tags of other extensions, without the schemas that their content is checked by.
+    """The tags of other extensions, without schema validation.
 
-    asdf checks a tree whenever it is read and whenever it is written.  To write, that took more
-    than half of the time, and what our trees have with schemas is what the converters of asdf and
-    gwcs have just made.
+    asdf validates a tree when it is written.  This takes more than half of the time, and all parts
+    of our trees with schemas have just been made by the converters of asdf and gwcs.
     """
 
     extension_uri = "asdf://wpdc_gwcs/extensions/unchecked-1.0.0"
@@ -275,7 +274,7 @@ def _unchecked(extensions):
 
 
 def _points_of(model):
-    """Yield the nodes of all tables that a model is made of, its inverse included."""
+    """Yield the nodes of all tables in a model, including its inverse."""
     if isinstance(model, CompoundModel):
         yield from _points_of(model.left)
         yield from _points_of(model.right)
@@ -285,28 +284,28 @@ def _points_of(model):
 
 
 def write_tree(tree, path, overwrite, compression=None):
-    """Write a tree in one step.
+    """Write a tree atomically.
 
     Parameters
     ----------
     tree : dict
-        What the file holds; a gwcs under ``wcs`` keeps the nodes of its tables in the text.
+        Content of the file; the tables of a gwcs under ``wcs`` keep their nodes as text.
     path : path-like
         File to write.
     overwrite : bool
         Whether an existing file may be replaced.
     compression : str, optional
-        Of the arrays, as asdf names it.
+        Compression of arrays, by its name in asdf.
     """
-    # A context copies what is loaded: extensions are to be looked for once, not for every file.
+    # The context copies the loaded extensions, so that they are searched only once.
     unchecked = _unchecked(load_extensions())
     with (
         atomic_path(path, overwrite=overwrite) as temporary,
         asdf.config_context() as config,
-        # Open, because asdf takes a path for a URL, in which '#', '?', ';' and '%' end the name.
+        # Open the file: asdf treats a path as a URL, in which '#', '?', ';' and '%' are special.
         open(temporary, "wb") as stream,
     ):
-        # Stock tables keep their nodes as they come from the file, which may be closed by then.
+        # Stock tables may refer to arrays of a file that is closed by then.
         steps = tree["wcs"].pipeline[:-1] if "wcs" in tree else ()
         nodes = [points.size for step in steps for points in _points_of(step.transform)]
         config.array_inline_threshold = 1 + max([_INLINE_VALUES, *nodes])
@@ -315,7 +314,7 @@ def write_tree(tree, path, overwrite, compression=None):
 
 
 def read_entry(path, key, *, whole=False):
-    """Read one entry of the tree and leave the others alone, which may be of newer libraries.
+    """Read one entry of the tree; the others may need newer libraries.
 
     Parameters
     ----------
@@ -324,12 +323,12 @@ def read_entry(path, key, *, whole=False):
     key : str
         Name of the entry.
     whole : bool, optional
-        Whether the end of the file is looked for, too.
+        Whether to check that the file ends properly, too.
 
     Returns
     -------
     object
-        Plain values, `None` where there is no such entry.
+        Plain values, `None` if there is no such entry.
 
     Raises
     ------
@@ -338,7 +337,7 @@ def read_entry(path, key, *, whole=False):
     """
     load_extensions()
     try:
-        # Absolute, since a leading '~' is not a name to asdf, even if the file is open.
+        # Absolute, since a leading '~' is special to asdf, even if the file is open.
         with open(Path(path).absolute(), "rb") as stream, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if whole:
@@ -355,7 +354,7 @@ def read_entry(path, key, *, whole=False):
 
 
 def _check_end(stream, path):
-    """Find a file that is cut short, also where it is cut behind the data."""
+    """Raise an error if a file is cut short, even after the data."""
     stream.seek(max(0, stream.seek(0, 2) - 4096))
     if not stream.read().rstrip(b"\0\r\n ").endswith(b"..."):
         raise FileFormatError(f"{path}: truncated ASDF file: must end with '...', does not")
@@ -378,7 +377,7 @@ def _entry(tree, key, path):
 
 
 def _fields_of(obj, left_out):
-    """Give every field of a dataclass as plain tree."""
+    """Convert every field of a dataclass to a plain tree."""
     tree = {}
     for field in dataclasses.fields(obj):
         if field.name in left_out:
@@ -392,9 +391,9 @@ def _fields_of(obj, left_out):
 
 
 def _plain(value, where):
-    """Give a value as what core ASDF knows."""
+    """Convert a value to types of core ASDF."""
     if isinstance(value, np.generic):
-        # Also where it is a Python number, as float64 is.
+        # Also NumPy scalars that are Python numbers, such as float64.
         return _plain(value.item(), where)
     if isinstance(value, str):
         return as_utf8(value)

@@ -1,4 +1,4 @@
-"""Files of one list: frames, and the masks and weights of frames that came with them.
+"""Lists of files: frames, and the masks and weights that belong to them.
 
 ::
 
@@ -18,21 +18,21 @@ __all__ = ["read_files", "tell_frames"]
 
 log = logging.getLogger(__name__)
 
-# Words of a name that may say together what a file is: bad_pixel_mask.
+# Words that together describe a file: bad_pixel_mask.
 _MOST_WORDS = 3
-# What two exposures do not share.
+# Keywords that differ between exposures.
 _TIMES = ("DATE-OBS", "MJD-OBS", "EXPNUM", "OBSID", "DATE-BEG", "TIME-OBS", "UTSTART")
 
 
 def read_files(paths, **options):
-    """Read the frames of several files, of which some may be masks and weights of others.
+    """Read the frames of several files, some of which may be masks or weights of others.
 
     Parameters
     ----------
     paths : iterable of path-like
         As for `wpdc_gwcs.io.read_frames`.
     **options
-        As for `wpdc_gwcs.io.read_frames`; a mask or a weight map that is given is used instead.
+        As for `wpdc_gwcs.io.read_frames`; an explicit mask or weight map takes precedence.
 
     Returns
     -------
@@ -51,7 +51,7 @@ def read_files(paths, **options):
 
 
 def tell_frames(paths):
-    """Tell the files that are frames from those that are masks and weights of others.
+    """Separate files of frames from masks and weights of others.
 
     Parameters
     ----------
@@ -61,14 +61,14 @@ def tell_frames(paths):
     Returns
     -------
     list of (path, list)
-        Each frame's file with the files of its masks and weights.
+        Path of each frame, and the list of its masks and weights.
 
     Notes
     -----
-    A file goes with another one if its name has a word more that says so (``x.weight.fits``,
+    A file belongs to another one if its name has an additional word for this (``x.weight.fits``,
     ``x_bad_pixel_mask.fits``), or such a word in place of one for images (``x_image.fits``,
-    ``x_invvar.fits``), if its images are of the same shapes, and neither WCS nor time speak against
-    it.  One whose frame is not there is a frame itself, for all that anyone can tell.
+    ``x_invvar.fits``), if its images have the same shapes, and if WCS and time do not contradict.
+    A file without such a frame counts as a frame itself.
     """
     paths = list(paths)
     names = {}
@@ -88,7 +88,7 @@ def tell_frames(paths):
 
 
 def _owners(path, names):
-    """Files of the list whose names lack what this one's says of masks and weights."""
+    """Files of the list with the same name, except for the words for masks and weights."""
     words = words_of(stem_of(path))
     for first in range(len(words)):
         for last in range(first + 1, min(first + _MOST_WORDS, len(words)) + 1):
@@ -107,7 +107,7 @@ def _belong(owner, path):
             return False
         sides = [_images(p) for p in (owner, path)]
     except FrameError:
-        # What is wrong with it is said when it is read.
+        # Errors are reported when the file is read.
         return False
     if not all(sides) or len(sides[0]) != len(sides[1]):
         return False
@@ -124,7 +124,7 @@ def _belong(owner, path):
 
 
 def _images(path):
-    """Headers of the images of a file, with what its first one says."""
+    """Headers of the images of a file, merged with its primary header."""
     with open_fits(path, error=FrameError) as hdus:
         result = []
         for hdu in hdus:

@@ -18,7 +18,7 @@ from wpdc_gwcs.io.tan import PV_CARD, idle_pv, parse_tan, require_place
 __all__ = ["parse_wcs"]
 
 
-# Words of RADESYS, without blanks, hyphens and underscores.  All realizations of ICRS are one here.
+# Values of RADESYS, without blanks, hyphens and underscores.  All realizations of ICRS are equal.
 _SYSTEMS = (
     ("ICRS", re.compile(r"ICR[SF]\d?|GAIA.*|HIPPARCOS|HIP|BCRS|GCRS")),
     ("FK4NOE", re.compile(r"FK4NOE(TERMS)?")),
@@ -30,7 +30,7 @@ _SYSTEMS = (
     ),
 )
 _UNKNOWN = re.compile(r"(UNKNOWN|UNDEFINED|NONE|NULL|N/?A|TBD|\?*)")
-# Equinox before which mean places are those of FK4 (paper II, section 3.1).
+# Mean places with an earlier equinox are FK4 (paper II, section 3.1).
 _FK4_BEFORE = 1984.0
 
 
@@ -44,7 +44,7 @@ def parse_wcs(header, *, hdus=None, name="header", error=FileFormatError, pixel_
     hdus : `~astropy.io.fits.HDUList`, optional
         File of the header, for look-up tables in it.
     name : str, optional
-        What messages call the header.
+        Name of the header in messages.
     error : type, optional
         Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
     pixel_scale : float, optional
@@ -53,7 +53,7 @@ def parse_wcs(header, *, hdus=None, name="header", error=FileFormatError, pixel_
     Returns
     -------
     wcs : `~astropy.wcs.WCS`
-        RA is the first world axis, in ICRS (FK5 of J2000 is taken for it: 0.02 arcsec).
+        RA is the first world axis, in ICRS (FK5 J2000 is treated as ICRS: 0.02 arcsec).
 
     Raises
     ------
@@ -63,8 +63,8 @@ def parse_wcs(header, *, hdus=None, name="header", error=FileFormatError, pixel_
     Warns
     -----
     WPDCWarning
-        If the reference system is one of apparent places, which are taken for mean places of their
-        equinox (up to 40 arcsec off), or is not known.
+        If the reference system is unknown, or is of apparent places, which are treated as mean
+        places of their equinox (up to 40 arcsec off).
     """
     if pixel_scale is not None:
         header = _with_scale(header, pixel_scale)
@@ -81,7 +81,7 @@ def parse_wcs(header, *, hdus=None, name="header", error=FileFormatError, pixel_
 
 
 def _with_scale(header, pixel_scale):
-    """Copy a header; where it has no linear part, with North up and East to the left."""
+    """Copy a header with a new scale; without a linear part, North is up and East left."""
     header = header.copy()
     if not any(re.fullmatch(r"CD\d_\d|PC\d_\d|PC00\d00\d|CDELT\d", key) for key in header):
         is_longitude = not header_text(header, "CTYPE1").upper().startswith("DEC")
@@ -92,7 +92,7 @@ def _with_scale(header, pixel_scale):
 
 
 def _sky_frame(header, wcs, name, error):
-    """Find the reference system of the celestial axes, as a frame of astropy."""
+    """Find the reference system of the celestial axes, as an astropy frame."""
     if not wcs.wcs.ctype[0].startswith("RA"):
         try:
             return wcs_to_celestial_frame(wcs)
@@ -136,7 +136,7 @@ def _sky_frame(header, wcs, name, error):
 
 
 def _equinox(header):
-    """Year of EQUINOX, or of EPOCH, as it was called once; `None` where it makes no sense."""
+    """Year of EQUINOX, or of EPOCH, its former name; `None` if it makes no sense."""
     for key in ("EQUINOX", "EPOCH"):
         value = header_value(header, key)
         if isinstance(value, str):
@@ -148,9 +148,9 @@ def _equinox(header):
 
 
 def _parse_other(header, hdus, name, error):
-    """SIP, other projections, look-up tables: what astropy makes of it."""
+    """Parse SIP, other projections and look-up tables with astropy."""
     if "SIP" in header_text(header, "CTYPE1") or idle_pv(header):
-        # SIP wins over what SCAMP left beside it.
+        # SIP wins over PV cards of SCAMP.
         header = header.copy()
         for key in [k for k in header if PV_CARD.fullmatch(k)]:
             del header[key]
@@ -160,7 +160,7 @@ def _parse_other(header, hdus, name, error):
             wcs = WCS(header, fobj=hdus, naxis=2)
             wcs.wcs.set()
     except (WcsError, *READ_ERRORS) as problem:
-        # wcslib mixes what it is with the places in its own code.
+        # Messages of wcslib include places in its source code.
         lines = [line for line in str(problem).splitlines() if line and "ERROR" not in line]
         reason = lines[-1] if lines else first_line(problem)
         raise error(f"{name}: not a usable WCS: {reason}") from problem
@@ -179,7 +179,7 @@ def _parse_other(header, hdus, name, error):
         wcs.wcs.set_pv(pv)
         wcs.wcs.set()
     if not wcs.wcs.tab:
-        # Of a table, CRVAL is a row.
+        # CRVAL of a table is a row number.
         require_place(*wcs.wcs.crval, name, error)
     shape = header_shape(header)
     if shape is not None:
@@ -188,7 +188,7 @@ def _parse_other(header, hdus, name, error):
 
 
 def _to_icrs(wcs, frame, name, error):
-    """Turn the sphere of a WCS to ICRS: another CRVAL, another LONPOLE, all else stays."""
+    """Rotate the sphere of a WCS to ICRS: only CRVAL and LONPOLE change."""
     equinox = getattr(getattr(frame, "equinox", None), "jyear", 2000.0)
     if frame.name == "icrs" or (frame.name == "fk5" and abs(equinox - 2000.0) < 1e-3):
         wcs.wcs.radesys, wcs.wcs.equinox = "ICRS", math.nan
@@ -196,7 +196,7 @@ def _to_icrs(wcs, frame, name, error):
         return wcs
     lon, lat = wcs.wcs.crval
     if wcs.wcs.theta0 == 90.0:
-        # Of a zenithal projection, the reference point is the pole of the native sphere.
+        # The reference point of a zenithal projection is the pole of the native sphere.
         north = min(lat + 1e-3, 90.0)
         if not north > lat:
             raise error(f"{name}: {frame.name} frame cannot be turned to ICRS at its own pole")
@@ -223,7 +223,7 @@ def _to_icrs(wcs, frame, name, error):
 
 
 def _check_turned(before, after, frame, name, error):
-    """Compare a WCS turned to ICRS with what it was, around its reference point."""
+    """Compare a WCS rotated to ICRS with the original, around its reference point."""
     x, y = before.wcs.crpix[:, np.newaxis] - 1.0 + 50.0 * np.array([[-1, 1, 1, -1], [-1, -1, 1, 1]])
     lon, lat = before.wcs_pix2world(x, y, 0)
     ra, dec = after.wcs_pix2world(x, y, 0)

@@ -1,23 +1,23 @@
-"""CHECKSUM of FITS: sums of 32-bit words with the carry brought round, and their spelling."""
+"""FITS CHECKSUM: ones' complement sums of 32-bit words, and their encoding."""
 
 import numpy as np
 
 __all__ = ["checksum_text", "sum_words"]
 
-# Not to stand in a checksum: what is neither a digit nor a letter.
+# Characters to avoid in a checksum: neither digits nor letters.
 _PUNCTUATION = frozenset(b":;<=>?@[\\]^_`")
 _WORDS_AT_A_TIME = 1 << 22
 
 
 def sum_words(data, total=0):
-    """Add bytes up as the FITS standard (4.0, appendix J) does.
+    """Sum bytes as in the FITS standard (4.0, appendix J).
 
     Parameters
     ----------
     data : bytes
         A whole number of words of four bytes.
     total : int, optional
-        Sum of what came before.
+        Sum so far.
 
     Returns
     -------
@@ -33,7 +33,7 @@ def sum_words(data, total=0):
 
 
 def checksum_text(total):
-    """Spell the value of a CHECKSUM card that makes the sum of an HDU minus zero.
+    """Encode the value of a CHECKSUM card that makes the sum of an HDU minus zero.
 
     Parameters
     ----------
@@ -58,5 +58,5 @@ def checksum_text(total):
                     four[k + 1] -= 1
         columns.append(four)
     text = "".join(chr(columns[byte][k]) for k in range(4) for byte in range(4))
-    # Turned by one place, since values of cards begin at the second byte of a word.
+    # Rotated by one character, because values of cards begin at the second byte of a word.
     return text[-1] + text[:-1]

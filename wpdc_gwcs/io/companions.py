@@ -1,4 +1,4 @@
-"""Images that go with an image: masks, weights, errors, times, known by name, place and pixels.
+"""Images that belong to an image: masks, weights, errors, times.
 
 ::
 
@@ -35,7 +35,7 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 
-# Words of extension names, by what the pixels say; the first family that has one wins.
+# Words of extension names by meaning; the first family with a match wins.
 _ROLES = {
     "mask": "GOODPIX DQ DQM DQF MASK MSK BPM BAD BADPIX FLAG FLAGS FLG QUALITY QUAL DEFECTS OOD",
     "weight": "CONF CONFIDENCE CONFMAP WHT WGT WEIGHT WEIGHTS WMAP IVAR INVVAR INVERSE INV OOW",
@@ -45,57 +45,57 @@ _ROLES = {
     "BKG BKGD BACKGROUND SKY MODEL RESIDUAL RESID AREA PSF IMARR WCSDVARR DVARR",
 }
 _ROLES = {role: frozenset(words.split()) for role, words in _ROLES.items()}
-# Files are told by the same words, but for those that say other things of exposures as well.
+# The same words for files, without those that have other meanings for exposures.
 _MAP_WORDS = {
     role: names - {"STD", "SIG", "BAD"} for role, names in _ROLES.items() if role != "other"
 }
-# Longer words count within others too (BADPIXELMASK, WEIGHTMAP).
+# Longer words are also found inside others (BADPIXELMASK, WEIGHTMAP).
 _LONGEST_PLAIN = 3
 SCIENCE_WORDS = frozenset(
     ("SCI", "SCIENCE", "IMAGE", "IMG", "DATA", "PRIMARY", "COMPRESSED", "OOI")
 )
-# The standard of HDUCLASS says it in so many words.
+# Values of the HDUCLASS convention.
 _CLASSES = {"ERROR": "error", "QUALITY": "mask", "WEIGHT": "weight"}
 _CLASS_VALUES = {"MSE": "variance", "RMSE": "error", "INVMSE": "weight", "INVRMSE": "other"}
 
-# Keywords that two extensions of one detector share, and two detectors do not.
+# Keywords that extensions of one detector share, but different detectors do not.
 _IDENTITY = ("CCDNAME", "CHIPNAME", "DETNAME", "DETECTOR", "CHIPID", "CCDNUM", "CCDCHIP", "DETSEC")
 WCS_KEYS = ("CRVAL1", "CRVAL2", "CRPIX1", "CRPIX2", "CD1_1", "CD1_2", "PC1_1", "CDELT1")
 
-# Planes of a mask by name (Rubin and its relatives, MP_name) that make a pixel useless; the others
-# say where sources are, or what was done with them.
+# Named mask planes (Rubin and similar, MP_name) that make a pixel useless; the others mark sources
+# or processing steps.
 _BAD_PLANES = frozenset(
     "BAD SAT INTRP CR EDGE NO_DATA SUSPECT UNMASKEDNAN CROSSTALK VIGNETTED".split()
 )
-# Telescopes whose lowest bit sums up the others.
+# Telescopes whose lowest bit is the logical or of the others.
 _DO_NOT_USE = ("JWST", "ROMAN")
 
-# A bit is looked at before it is believed if more than this share of the pixels has it: for marking
-# sources, and for saying nothing, which it can only for areas that no defects cover.
+# A bit is checked if more than these fractions of the pixels have it: for marking sources, and for
+# marking nothing special, which applies only to areas larger than defects.
 _FEW, _SHARE = 0.001, 0.05
-# Pixels like the rest: their median to a standard deviation, their scatter within a factor, their
-# share of outliers within a factor and a floor.
+# Pixels are like the rest if their median agrees within this many standard deviations, and their
+# scatter and fraction of outliers agree within a factor (the latter with a floor).
 _MEDIAN, _SCATTER, _OUTLIERS, _OUTLIER_FLOOR = 1.0, 1.4, 2.0, 0.003
 _N_SAMPLE = 200_000
-# A bit of sources: its pixels lie side by side and are most of those that are bright (in standard
-# deviations), but not so bright that they are saturated.
+# A bit marks sources if its pixels are contiguous and are most of the bright ones (in standard
+# deviations), but not saturated.
 _BRIGHT, _TOO_BRIGHT, _OF_SOURCES, _CONNECTED = 5.0, 50.0, 0.5, 0.7
 
 
 @dataclass(frozen=True)
 class Companion:
-    """An image extension that goes with another one.
+    """An image extension that belongs to another one.
 
     Parameters
     ----------
     path : str
-        File.
+        Path of the file.
     index : int
         Number of the extension.
     role : {"mask", "weight", "error", "variance", "other"}
-        What its pixels say.
+        Meaning of the pixels.
     given : bool, optional
-        Whether the user named it: then all that it marks is bad.
+        Whether the user gave it: then everything it marks is bad.
     """
 
     path: str
@@ -105,7 +105,7 @@ class Companion:
 
 
 def pair_companions(hdus, images, path):
-    """Tell frames from what goes with them.
+    """Assign masks, weights and other companions to frames.
 
     Parameters
     ----------
@@ -123,8 +123,8 @@ def pair_companions(hdus, images, path):
 
     Notes
     -----
-    A companion is known by a word of its name or by the standard of ``HDUCLASS``; without either,
-    by the WCS of a frame of another name, which no two detectors have in common.
+    A companion is recognized by a word of its name or by ``HDUCLASS``; without either, by having
+    the same WCS as a frame with another name, which different detectors never have.
     """
     roles = {i: _role_of(hdus[i]) for i in images}
     main = [i for i in images if roles[i] is None] or list(images)
@@ -182,7 +182,7 @@ def _role_by(words, roles):
 
 
 def map_role(words):
-    """Tell what the pixels of a file are by words of its name.
+    """Find the meaning of the pixels of a file from words of its name.
 
     Parameters
     ----------
@@ -192,14 +192,14 @@ def map_role(words):
     Returns
     -------
     {"mask", "weight", "error", "variance"} or None
-        `None` where they do not say.
+        `None` if the words do not tell.
     """
-    # Together as well: bad_pixel_map.
+    # Also joined words: bad_pixel_map.
     return _role_by([*words, "".join(words)], _MAP_WORDS)
 
 
 def _kinship(frame, other):
-    """Rank of how surely two extensions belong together."""
+    """Rank of the evidence that two extensions belong together."""
     rest = [
         [
             w
@@ -216,18 +216,18 @@ def _same(one, other, keys):
 
 
 def _is_twin(frame, other):
-    """Whether an extension has the WCS of a frame, and nothing says that it is another detector."""
+    """Whether an extension has the WCS of a frame and is not evidently another detector."""
     if _shape(frame) != _shape(other) or "CRVAL1" not in other.header:
         return False
     if not (_same(frame, other, WCS_KEYS) and _same(frame, other, _IDENTITY)):
         return False
-    # Numbers apart, detectors of one camera have one name.
+    # Except for numbers, detectors of one camera have the same name.
     kind = [[w for w in words_of(h.name) if not w.isdigit()] for h in (frame, other)]
     return kind[0] != kind[1]
 
 
 def _looks_like_mask(hdu):
-    """Whether pixels are whole numbers, most of them zero."""
+    """Whether pixels are integers, most of them zero."""
     if hdu.header.get("BITPIX", -32) < 0:
         return False
     try:
@@ -237,13 +237,13 @@ def _looks_like_mask(hdu):
 
 
 def given_plane(path, frame_index, frame_name, shape, role):
-    """Find the mask or the weight that a file has for a frame.
+    """Find the mask or the weight for a frame in a file.
 
     Parameters
     ----------
     path : path-like
-        FITS image, ``path`` or ``path[EXT]``; of several images the one with the name or, failing
-        that, the number of the frame's extension is taken.
+        FITS image, ``path`` or ``path[EXT]``; from several images, the one with the name or else
+        the number of the extension of the frame.
     frame_index : int
         Extension of the frame.
     frame_name : str
@@ -251,12 +251,12 @@ def given_plane(path, frame_index, frame_name, shape, role):
     shape : (int, int)
         Shape of the frame.
     role : {"mask", "weight"}
-        What it is wanted for; a map named after errors or variances is taken as such.
+        Purpose; a map with a name for errors or variances is used as such.
 
     Returns
     -------
     Companion
-        Where it is.
+        The extension.
 
     Raises
     ------
@@ -288,7 +288,7 @@ def given_plane(path, frame_index, frame_name, shape, role):
 
 
 def map_beside(path, frame_index, frame_name, shape):
-    """Find the mask or the weight that a file beside that of a frame has for it.
+    """Find the mask or the weight for a frame in a file next to it.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ def map_beside(path, frame_index, frame_name, shape):
     Returns
     -------
     Companion
-        Where it is, and what, by the name of the file.
+        The extension, with its role from the name of the file.
     """
     role = map_role(words_of(stem_of(path)))
     found = given_plane(path, frame_index, frame_name, shape, role)
@@ -312,7 +312,7 @@ def map_beside(path, frame_index, frame_name, shape):
 
 
 def data_section(header, shape):
-    """Part of an image that has seen the sky, by DATASEC or TRIMSEC.
+    """Return the part of an image that is exposed to the sky, from DATASEC or TRIMSEC.
 
     Parameters
     ----------
@@ -324,8 +324,8 @@ def data_section(header, shape):
     Returns
     -------
     (slice, slice) or None
-        Rows and columns; `None` where it is all of the image, or where the section is that of
-        other pixels (those before a trim, for example).
+        Rows and columns; `None` if it is the whole image, or the section is in other pixels (for
+        example those before a trim).
     """
     for key in ("DATASEC", "TRIMSEC"):
         match = re.fullmatch(
@@ -351,12 +351,12 @@ def load_mask(masks, section, shape, bits, load_image):
     masks : sequence of Companion
         Masks.
     section : (slice, slice) or None
-        Part of the image that has seen the sky.
+        Part of the image that is exposed to the sky.
     shape : (int, int)
         Shape of the image.
     bits : int or None
-        Bits that are bad; `None`: those that the header names, or all but those whose pixels are
-        like the rest, or that mark sources.
+        Bits that mean bad; `None` for those that the header names, or else all except bits whose
+        pixels are like the rest and bits that mark sources.
     load_image : callable
         Returns the image.
 
@@ -391,7 +391,7 @@ def _bad_pixels(values, header, bits, load_image, mask):
         return values & 1 != 0
     different = np.unique(values)
     if len(different) == 2 and different[0] == 0 and np.mean(values != 0) > 0.5:
-        return values == 0  # ones for the good
+        return values == 0  # ones mean good
     present = int(np.bitwise_or.reduce(values, axis=None))
     bad = np.zeros(values.shape, bool)
     clean, image = values == 0, None
@@ -411,9 +411,9 @@ def _bad_pixels(values, header, bits, load_image, mask):
 
 
 def _says_nothing(image, has, alone, clean):
-    """Whether the pixels that have a bit are like those that have none, or are those of sources.
+    """Whether pixels with a bit are like those without any, or are those of sources.
 
-    The bit alone is compared, where others are not the reason for what the pixels look like.
+    Only pixels without other bits are compared.
     """
     rest = _sample(image[clean])
     if rest.size < 100:
@@ -472,7 +472,7 @@ def load_weight(companion, shape):
             WPDCWarning,
         )
         return None
-    # By their median, so that squares stay within float32 in any unit.
+    # Relative to the median, so that squares stay within float32 in any unit.
     values = np.where(good, values / np.median(values[good]), 0.0)
     power = {"weight": 1, "variance": -1, "error": -2}[companion.role]
     with np.errstate(divide="ignore"):

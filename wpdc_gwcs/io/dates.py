@@ -1,10 +1,10 @@
 """Dates of FITS headers: the epoch in the middle of an exposure, and when it began.
 
-Observatories have their own keywords.  What one of them says is told by the words that it is made
-of: a day (``MJD``, ``JD``, ``DATE``), what is observed (``OBS``, ``EXP``, ``SHUT``, ...) and a
+Observatories have their own keywords.  Their meaning is derived from the words that they consist
+of: a day (``MJD``, ``JD``, ``DATE``), an observation (``OBS``, ``EXP``, ``SHUT``, ...) and a
 moment (``BEG``, ``START``, ``OPEN``; ``END``, ``CLOS``; ``AVG``, ``MID``), in any order and with or
-without hyphens.  A keyword with any other word in it (``DATE-MAP``, ``MJDREF``) is of something
-else.
+without hyphens.  A keyword with any other word in it (``DATE-MAP``, ``MJDREF``) is
+ignored.
 """
 
 import re
@@ -24,7 +24,7 @@ _MODERN_MJD = (45000.0, 75000.0)
 _JD_FROM = 2.3e6
 _JD_MINUS_MJD = 2400000.5
 _YEARS = (1800.0, 2200.0)
-# Exposures are no longer than that, d.
+# Maximum exposure time, d.
 _LONGEST = 10.0
 # Seconds to add for TT.  UTC has the leap seconds of today: a few too many for old plates.
 _TO_TT = {
@@ -42,7 +42,7 @@ _TO_TT = {
     "TCB": 0.0,
     "TCG": 0.0,
 }
-# Keywords of the standard (and those that everyone takes for it), best first, by moment.
+# Standard keywords (and de facto ones), best first, by moment.
 _STANDARD = {
     "mid": ("MJDAVG", "DATEAVG"),
     "begin": ("MJDBEG", "DATEBEG"),
@@ -62,7 +62,7 @@ _WORD = re.compile(
     f"|(?P<end>{_MOMENTS['end']})|(?P<mid>{_MOMENTS['mid']}))"
 )
 _KEYWORD = re.compile(f"(?:{_DAY}|{_THING}|{_SCALE}|{'|'.join(_MOMENTS.values())})+")
-# Clocks that go with a date without one.
+# Keywords with the time of day for a date without one.
 _CLOCK_KEYS = ("TIME-OBS", "UTC-OBS", "UT", "UTC", "UT-OBS", "UTSTART", "UT-STR", "UTC-BEG")
 #: Keywords of the exposure time.
 EXPOSURE_KEYS = (
@@ -73,7 +73,7 @@ EXPOSURE_KEYS = (
 
 @dataclass(frozen=True)
 class _Date:
-    """What a keyword says: moment, modified Julian date and its time system."""
+    """Content of a keyword: moment, modified Julian date and time system."""
 
     moment: str
     key: str
@@ -89,9 +89,9 @@ def header_epoch(headers, *, name="header"):
     Parameters
     ----------
     headers : sequence of `~astropy.io.fits.Header`
-        Looked through in turn for each keyword, the header of the image first.
+        Searched in turn for each keyword, the header of the image first.
     name : str, optional
-        What messages call the header.
+        Name of the header in messages.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def header_epoch(headers, *, name="header"):
     found, broken = _dates(headers)
     chosen, used = _middle(found, exposure)
     standard = {k for keys in _STANDARD.values() for k in keys}
-    # What was passed over on the way; of other keywords only where nothing else tells.
+    # Invalid dates on the way; those of nonstandard keywords only if nothing else tells.
     problems += [
         text
         for rank, key, text in broken
@@ -153,7 +153,7 @@ def header_start(headers):
     Parameters
     ----------
     headers : sequence of `~astropy.io.fits.Header`
-        Looked through in turn for each keyword, the header of the image first.
+        Searched in turn for each keyword, the header of the image first.
 
     Returns
     -------
@@ -169,7 +169,7 @@ def header_start(headers):
 
 
 def read_epoch(text):
-    """Read an epoch as it is given by hand.
+    """Parse an epoch that a user gives.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def julian_year(mjd, seconds=0.0):
     mjd : float
         The date.
     seconds : float, optional
-        To be added, to get to TT.
+        Seconds to add, to convert to TT.
 
     Returns
     -------
@@ -227,7 +227,7 @@ def julian_year(mjd, seconds=0.0):
 
 
 def _middle(found, exposure):
-    """Middle of the exposure with its time system, or None, and the rank of what tells it."""
+    """Middle of the exposure with its time system (or None), and the rank of its source."""
     best = {}
     for date in found:
         moment = "start" if date.moment == "begin" and date.key in _STANDARD["start"] else None
@@ -255,7 +255,7 @@ def _middle(found, exposure):
 
 
 def _rank(moment, key, place):
-    """Order in which keywords are believed: the standard's, then others, by header and place."""
+    """Order of trust in keywords: standard ones, then others, by header and position."""
     group = {"mid": 0, "begin": 1, "end": 1, "start": 1}[moment]
     standard = _STANDARD[moment]
     if key in standard:
@@ -266,7 +266,7 @@ def _rank(moment, key, place):
 
 
 def _dates(headers):
-    """All dates of some headers, and the cards that look like dates and are none."""
+    """All dates in headers, and the cards that look like dates but are invalid."""
     found, broken, place = [], [], 0
     for header in headers:
         for keyword in header:
@@ -285,7 +285,7 @@ def _dates(headers):
 
 
 def _plain(keyword):
-    """Keyword without hyphens; of a hierarchical one, what stands behind the last names."""
+    """Keyword without hyphens; for a hierarchical one, its last part."""
     words = re.sub(r"[-_.]", "", keyword.upper()).split()
     for k in range(max(0, len(words) - 3), len(words)):
         if _KEYWORD.fullmatch("".join(words[k:])):
@@ -295,9 +295,9 @@ def _plain(keyword):
 
 @lru_cache(maxsize=4096)
 def _moment(key):
-    """Which moment a keyword is of: ``mid``, ``begin``, ``end``, ``start``; `None` if of none."""
+    """Moment of a keyword: ``mid``, ``begin``, ``end``, ``start``; `None` for none."""
     if key in ("DATE", "EPOCH") or not _KEYWORD.fullmatch(key):
-        # DATE is that of the file, EPOCH was the equinox once.
+        # DATE is that of the file, EPOCH is the old name of the equinox.
         return None
     kinds = _kinds(key)
     return next((k for k in ("mid", "end", "begin") if k in kinds), "start")
@@ -310,7 +310,7 @@ def _kinds(key):
 
 
 def _date_of(header, keyword, key, moment, place):
-    """Read the date that a card gives, `None` if it gives none."""
+    """Read the date of a card, `None` if there is none."""
     value = header_value(header, keyword)
     rank = _rank(moment, key, place)
     if isinstance(value, str):
@@ -329,7 +329,7 @@ def _date_of(header, keyword, key, moment, place):
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     number = float(value)
-    # A zero stands for a date that was not filled in.
+    # Zero means a date that was not filled in.
     if number == 0:
         return None
     if number > _JD_FROM:

@@ -1,4 +1,4 @@
-"""A WCS into the image itself: cards and tables are exchanged, every other byte is copied.
+"""Writing a WCS into an image: cards and tables are replaced, every other byte is copied.
 
 ::
 
@@ -39,17 +39,17 @@ from wpdc_gwcs.io.stale import alternates_of, is_stale, tables_of
 
 __all__ = ["INTO_FORMS", "write_into"]
 
-#: Forms that an image can have.
+#: Forms that can be written into an image.
 INTO_FORMS = ("tpv", "sip", "cpdis", "fits", "tab")
 _BLOCK = 2880
 _CHUNK = 1 << 24
-# The written file is read back: it must be as good as it was said to be, but for rounding.
+# The written file is read back: it must be as accurate as stated, up to rounding.
 _READ_BACK = 1.1
 _ROUNDING_PX = 1e-5
 
 
 class _Part(NamedTuple):
-    """One HDU of a file: where its header and its data stand, and what it is."""
+    """One HDU of a file: positions of its header and data, and its kind."""
 
     header: fits.Header
     start: int
@@ -61,15 +61,15 @@ class _Part(NamedTuple):
 def write_into(
     obj, image, *, form="tpv", degree=None, output=None, alternates="keep", overwrite=False
 ):
-    """Write the WCS of a calibration into an image, in one step.
+    """Write the WCS of a calibration into an image, atomically.
 
     Parameters
     ----------
     obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
         The calibration.
     image : path-like
-        FITS image, ``path[EXT]`` where there are several in the file; tile-compressed or compressed
-        as a whole, too.
+        FITS image, ``path[EXT]`` if there are several in the file; also tile-compressed or
+        compressed as a whole.
     form : {"tpv", "sip", "cpdis", "fits", "tab"}, optional
         See `wpdc_gwcs.export.make_form`.
     degree : int, optional
@@ -77,7 +77,7 @@ def write_into(
     output : path-like, optional
         Copy to write; by default the image itself is replaced.
     alternates : {"keep", "remove"}, optional
-        What becomes of alternate WCSs (``CTYPE1A``...).  Those that use the SIP terms of the old
+        Treatment of alternate WCSs (``CTYPE1A``...).  Those that use the SIP terms of the old
         WCS are removed in any case.
     overwrite : bool, optional
         Whether an existing copy may be replaced.
@@ -85,12 +85,13 @@ def write_into(
     Returns
     -------
     made : `~wpdc_gwcs.export.FitsForm`
-        What was written.
+        The written form.
 
     Raises
     ------
     InputError
-        If the file is no such image, of another shape than the detector, or cannot be written.
+        If the file is not such an image, has another shape than the detector, or cannot be
+        written.
     ValueError
         If a choice is unknown.
 
@@ -104,14 +105,14 @@ def write_into(
     All terms of the old WCS are removed: CD, PC, CDELT, CROTA, PV, PS, SIP, CPDIS, D2IM, plate
     solutions, LONPOLE and so on, with the tables that they refer to unless another image of the
     file needs them.  All other cards, the data, and all other HDUs are copied byte by byte.
-    Where there was a CHECKSUM, there is again.  The file is read back before it gets its name.
+    A CHECKSUM is updated if there was one.  The file is read back before it gets its final name.
     """
     if form not in INTO_FORMS:
         raise ValueError(f"format must be one of {', '.join(INTO_FORMS)}, got {form!r}")
     if alternates not in ("keep", "remove"):
         raise ValueError(f"alternates must be 'keep' or 'remove', got {alternates!r}")
     path, extension = split_extension(image)
-    # Behind a symbolic link the file is replaced, not the link.
+    # Replace the file that a symbolic link points to, not the link.
     path = Path(os.path.realpath(path))
     target = path if output is None else Path(output)
     check_output(target, overwrite=overwrite or output is None)
@@ -129,7 +130,7 @@ def write_into(
         for other, part in enumerate(parts):
             if other != number:
                 gone -= tables_of(part.header)
-    # Tables of a WCS are never among the images that somebody may want, whatever their names.
+    # Tables of a WCS are never images to choose from, whatever their names.
     kept = [
         part
         for k, part in enumerate(parts)
@@ -168,18 +169,18 @@ def write_into(
 
 
 def _copy_owner(path, temporary):
-    """Give a file the owner and the rights of another, as far as one may."""
+    """Give a file the owner and permissions of another, as far as permitted."""
     state = path.stat()
     if hasattr(os, "chown"):
         with contextlib.suppress(OSError):
             os.chown(temporary, state.st_uid, state.st_gid)
-    # Behind the owner, since a new one takes some rights away.
+    # After the owner, because a change of owner clears some permissions.
     shutil.copymode(path, temporary)
 
 
 @contextlib.contextmanager
 def _named(image):
-    """Say whose headers they are that astropy does not understand."""
+    """Name the image in errors of astropy about its headers."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -192,7 +193,7 @@ def _named(image):
 
 def _read_parts(path):
     with open_fits(path):
-        # That it is complete.
+        # Check that it is complete.
         pass
     parts = []
     with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
@@ -212,12 +213,12 @@ def _is_image(header):
 
 
 def _may_be_table(part):
-    """Tell a table of columns, and an image of the names that look-up tables have."""
+    """Whether an HDU is a table, or an image with a name of look-up tables."""
     return not _is_image(part.header) or part.name[0] in ("WCSDVARR", "D2IMARR")
 
 
 def _choose(parts, extension, path):
-    """Give the number of the image that is meant."""
+    """Return the number of the image that is meant."""
     with open_fits(path, lazy=True) as hdus:
         names = extension_names(hdus)
         number = None if extension is None else find_extension(hdus, extension, path)
@@ -255,7 +256,7 @@ def _copy_bytes(source, copy, start, end):
         copy.write(chunk)
         left -= len(chunk)
     if end is not None and left:
-        # Padding that was left out at the end of the file.
+        # Padding is missing at the end of the file.
         copy.write(b"\0" * int(left))
 
 
@@ -289,11 +290,11 @@ def _copy_target(source, copy, part, made, letters, image):
 
 
 def _without_stale(cards, letters):
-    """Leave out stale cards; the rest, and where the first of them stood."""
+    """Remove stale cards; return the rest and the position of the first one removed."""
     left, place, following = [], None, False
     for card in cards:
-        # What goes on in CONTINUE cards goes with them; so does the checksum of a header that
-        # tile compression replaced.
+        # CONTINUE cards go with them, and so does the checksum of a header that tile
+        # compression replaced.
         stale = following if card.startswith("CONTINUE") else is_stale(card, letters)
         stale = stale or card.startswith("ZHECKSUM=")
         following = stale
@@ -314,13 +315,13 @@ def _pad(cards):
 
 
 def _checksum_card(card, value):
-    """Exchange the value; what is behind one of another length is no comment."""
+    """Replace the value; keep the comment only if the length is the same."""
     comment = card[28:] if card[10] == card[27] == "'" else ""
     return f"CHECKSUM= '{value}'{comment}".ljust(80)
 
 
 def _data_sum(source, part):
-    """Give the sum of the data: as stated, so that damage stays visible, or counted."""
+    """Return the sum of the data: as stated, so that damage stays visible, or counted."""
     stated = header_value(part.header, "DATASUM")
     if stated is not None and str(stated).strip().isdigit():
         return int(stated)
@@ -339,7 +340,7 @@ def _history(made):
 
 
 def _table_bytes(tables, header):
-    """Give the bytes of extensions, with checksums where the image has them."""
+    """Return the bytes of extensions, with checksums where the image has them."""
     if not tables:
         return b""
     file = io.BytesIO()
@@ -349,11 +350,11 @@ def _table_bytes(tables, header):
 
 
 def _check(obj, made, path, number, image):
-    """Read the file back: nothing of the old WCS may have a say in it."""
+    """Read the file back: the old WCS must have no effect on it."""
     try:
         with open_fits(path) as hdus:
             header = hdus[number].header.copy()
-            # Not the images of a mosaic, which are large.
+            # Without the other images of a mosaic, which are large.
             wanted = set() if made.form == "fits" else tables_of(header)
             tables = [h.copy() for h in hdus[1:] if (h.name.upper(), h.ver) in wanted]
     except InputError as problem:

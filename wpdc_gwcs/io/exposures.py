@@ -1,4 +1,4 @@
-"""What the headers say of the camera and of the exposure that a frame belongs to."""
+"""Camera and exposure of a frame, from its headers."""
 
 import re
 
@@ -11,8 +11,8 @@ from wpdc_gwcs.io.headers import header_text
 __all__ = ["camera_key", "exposure_key", "has_identifier"]
 
 _CAMERA_KEYS = ("INSTRUME", "TELESCOP")
-# Identifiers that the detectors of one exposure share.  Some observatories number anew every night
-# or give one to a block of exposures: `wpdc_gwcs.calibration.exposures` looks at the time as well.
+# Identifiers that the detectors of an exposure share.  Some observatories restart the numbers every
+# night, or share one in a block of exposures: `wpdc_gwcs.calibration.exposures` also checks times.
 _EXPOSURE_KEYS = (
     "EXPNUM",
     "EXP-ID",
@@ -24,7 +24,7 @@ _EXPOSURE_KEYS = (
     "OBSNUM",
     "ROOTNAME",
 )
-# What stands in a header where nobody filled it in.
+# Placeholders in headers.
 _PLACEHOLDERS = {"", "0", "-1", "NONE", "NULL", "NAN", "UNKNOWN", "UNDEFINED", "N/A", "TBD"}
 
 
@@ -34,7 +34,7 @@ def camera_key(headers):
     Parameters
     ----------
     headers : sequence of `~astropy.io.fits.Header`
-        Looked through in turn, the header of the frame first.
+        Searched in turn, the header of the frame first.
 
     Returns
     -------
@@ -47,16 +47,16 @@ def camera_key(headers):
 
 
 def exposure_key(headers, *, keyword=None, name="header"):
-    """Find what tells the exposure of a frame from others of its camera.
+    """Find the identifier of the exposure of a frame among those of its camera.
 
     Parameters
     ----------
     headers : sequence of `~astropy.io.fits.Header`
-        Looked through in turn, the header of the frame first.
+        Searched in turn, the header of the frame first.
     keyword : str, optional
-        The keyword that tells it; without, ``EXPNUM`` and the like, else the time of its start.
+        Keyword with the identifier; by default ``EXPNUM`` and similar, else the start time.
     name : str, optional
-        What messages call the header.
+        Name of the header in messages.
 
     Returns
     -------
@@ -66,7 +66,7 @@ def exposure_key(headers, *, keyword=None, name="header"):
     Raises
     ------
     FrameError
-        If the keyword that is asked for is not there.
+        If the requested keyword is missing.
     """
     if keyword is not None:
         text = _first_text(headers, (keyword,))
@@ -82,13 +82,13 @@ def exposure_key(headers, *, keyword=None, name="header"):
     start = header_start(headers)
     if start is None:
         return None
-    # Milliseconds: finer than any header means it, coarser than the round-off of a date.
+    # Milliseconds: finer than the precision of headers, coarser than rounding errors of dates.
     date = np.datetime64("1858-11-17", "ms") + np.timedelta64(round(start * 86_400_000), "ms")
     return str(date)
 
 
 def has_identifier(headers):
-    """Tell whether an exposure has a name of its own in the headers, not only a time.
+    """Return whether the headers have an identifier of the exposure, not only a time.
 
     Parameters
     ----------

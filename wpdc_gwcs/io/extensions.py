@@ -1,4 +1,4 @@
-"""The extensions of asdf, loaded with the faster of the parsers that PyYAML has."""
+"""The extensions of asdf, loaded with the fast parser of PyYAML."""
 
 import threading
 
@@ -11,18 +11,18 @@ _lock = threading.Lock()
 
 
 def load_extensions():
-    """Load the extensions of asdf, once in the life of a process.
+    """Load the extensions of asdf, once per process.
 
     Returns
     -------
     tuple of asdf.extension.Extension
-        All that are installed.
+        All installed extensions.
 
     Notes
     -----
-    asdf-astropy has some fifty manifests, which asdf has PyYAML's parser in Python read: as long
-    as it takes to measure the stars of a small frame.  Where PyYAML was built with libyaml, that
-    reads the same by a safe loader too, twenty times as fast.
+    asdf-astropy has some fifty manifests, which asdf reads with the pure Python parser of PyYAML;
+    this takes as long as measuring the stars of a small frame.  The safe loader of libyaml, if
+    PyYAML has it, reads the same twenty times as fast.
     """
     with _lock:
         in_python = yaml.safe_load

@@ -1,4 +1,4 @@
-"""Files in general: their kind, whether they are complete, and writing them in one step."""
+"""Files in general: their kind, completeness, and atomic writing."""
 
 import bz2
 import contextlib
@@ -33,7 +33,7 @@ __all__ = [
 
 _BLOCK = 2880
 _LONGEST_ENDING = 16
-# The standard has no more axes, and no file system files of more bytes.
+# Maximum number of axes in the standard, and of bytes in a file.
 _MOST_AXES, _MOST_BYTES = 999, 1 << 63
 _OPENERS = {"gzip": gzip.open, "bzip2": bz2.open, "xz": lzma.open}
 _MAGIC = (
@@ -53,11 +53,11 @@ _UNFIT = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\udc80-\udcff]")
 
 
 class OutputExistsError(InputError, FileExistsError):
-    """A file that would be written is there already and may not be replaced."""
+    """An output file exists and may not be replaced."""
 
 
 def first_line(error):
-    """Give the first line of an error's message, for messages of one line.
+    """Return the first line of an error's message, for messages of one line.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def first_line(error):
     Returns
     -------
     line : str
-        The name of its type if it has no message.
+        First line of the message, or the name of its type without one.
     """
     return str(error).strip().split("\n")[0] or type(error).__name__
 
@@ -95,7 +95,7 @@ def as_utf8(text):
 
 
 def stem_of(path):
-    r"""Return the name of a file without its folder and without the endings of data files.
+    r"""Return the name of a file without its folder and the suffixes of data files.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def file_kind(path, *, error=FileFormatError):
             raise error(f"{path}: damaged {kind} file: {first_line(problem)}") from problem
         kind = "fits" if start == b"SIMPLE  =" else "text"
     if kind == "fits" and (start[80:] in (b"\n", b"\r") or _HEADER_NAME.search(path.name)):
-        # A header alone, as text: cards in lines, or without line ends under a name that says so.
+        # A header alone as text: cards in lines, or without line ends if the name says so.
         kind = "text"
     if kind != "fits" and _FITS_NAME.search(path.name):
         shown = start[:9].decode("latin-1")
@@ -175,7 +175,7 @@ def file_kind(path, *, error=FileFormatError):
 
 @contextlib.contextmanager
 def open_fits(path, *, error=FileFormatError, lazy=False):
-    """Open a FITS file after making sure that all of it is there.
+    """Open a FITS file after checking that it is complete.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def open_fits(path, *, error=FileFormatError, lazy=False):
     error : type, optional
         Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised for any damage.
     lazy : bool, optional
-        Read extensions when they are asked for: for one of many.
+        Read extensions on access, for use of one of many.
 
     Yields
     ------
@@ -202,7 +202,7 @@ def open_fits(path, *, error=FileFormatError, lazy=False):
     if (what := special_file(path)) is not None:
         raise error(f"{path}: must be a file, is {what}")
     number = _check_once(path, error)
-    # Open, so that it is closed whatever astropy makes of it, and '~' is a name like any other.
+    # Pass an open file: it is closed in any case, and '~' is an ordinary character.
     with warnings.catch_warnings(), open(path, "rb") as stream:
         warnings.simplefilter("ignore")
         try:
@@ -211,18 +211,18 @@ def open_fits(path, *, error=FileFormatError, lazy=False):
             raise error(f"{path}: damaged FITS file: {first_line(problem)}") from problem
         with hdus:
             if not lazy and len(hdus) < number:
-                # astropy leaves out what it cannot read, and all behind it.
+                # astropy silently drops what it cannot read, and everything after it.
                 raise error(f"{path}: damaged FITS file: HDU {len(hdus)} cannot be read")
             try:
                 yield hdus
             except InputError:
                 raise
             except READ_ERRORS as problem:
-                # Much of a header is read only when it is asked for.
+                # Parts of a header are parsed only on access.
                 raise error(f"{path}: damaged FITS file: {first_line(problem)}") from problem
 
 
-# Files that were found complete, as they were then: each frame of a mosaic opens its file anew.
+# Files known to be complete, with their state: each frame of a mosaic opens its file again.
 _complete = {}
 
 
@@ -239,21 +239,21 @@ def _check_once(path, error):
 
 @contextlib.contextmanager
 def open_stream(path, mode="rb", *, like=None):
-    """Open a file for its bytes, decompressed and compressed on the way.
+    """Open a file as a stream of bytes, with transparent compression.
 
     Parameters
     ----------
     path : path-like
         The file.
     mode : {"rb", "wb"}, optional
-        To read or to write.
+        Read or write.
     like : path-like, optional
         File whose compression a new file gets; itself by default.
 
     Yields
     ------
     stream : file object
-        Of the bytes before compression.
+        Yields or takes the uncompressed bytes.
     """
     with open(path if like is None else like, "rb") as file:
         start = file.read(9)
@@ -281,7 +281,7 @@ def check_complete(path, *, error=FileFormatError):
     ------
     InputError
         If a header does not end or the data of an HDU end early.  Missing padding after the last
-        data is let pass: files without it are common and lack nothing.
+        data is accepted: such files are common and have all data.
     """
     path = Path(path)
     try:
@@ -291,7 +291,7 @@ def check_complete(path, *, error=FileFormatError):
         if kind in _OPENERS:
             with _OPENERS[kind](path, "rb") as file:
                 number = _walk(file, path, error, size=None)
-                # The trailing checksum of the compressed stream counts too.
+                # Also verifies the checksum at the end of the compressed stream.
                 while file.read(1 << 24):
                     pass
         else:
@@ -307,7 +307,7 @@ def check_complete(path, *, error=FileFormatError):
 
 
 def _walk(file, path, error, size):
-    """Go from header to header; `size` is the length of the file where it is known."""
+    """Go from header to header; `size` is the length of the file, if known."""
     number = position = 0
     while True:
         header = _read_mandatory(file, path, error, number)
@@ -355,7 +355,7 @@ def _read_mandatory(file, path, error, number):
     while True:
         block = file.read(_BLOCK)
         if found["length"] == 0 and block[:8] not in (b"SIMPLE  ", b"XTENSION"):
-            # The end, or what the standard calls special records and tells readers to skip.
+            # The end, or special records, which the standard tells readers to skip.
             return None
         found["length"] += _BLOCK
         for i in range(0, len(block), 80):
@@ -370,7 +370,7 @@ def _read_mandatory(file, path, error, number):
 
 
 def check_output(path, *, overwrite):
-    """Make sure that a file may be written, before any work is done for it.
+    """Check that a file can be written, before any work is done for it.
 
     Parameters
     ----------
@@ -397,7 +397,7 @@ def check_output(path, *, overwrite):
     if mode is not None and stat.S_ISDIR(mode):
         raise InputError(f"{path}: the output must be a file, is a folder")
     if mode is not None and not stat.S_ISREG(mode):
-        # To replace a device by a file takes it from everyone.
+        # Replacing a device by a file would remove it for everyone.
         raise InputError(f"{path}: the output must be a file, is a device, pipe or socket")
     if mode is not None and not overwrite:
         raise OutputExistsError(f"{path}: file exists and is kept; overwriting must be asked for")
@@ -408,14 +408,14 @@ def check_output(path, *, overwrite):
 
 
 def place(temporary, path, *, overwrite):
-    """Give a finished file its name.
+    """Give a finished file its final name.
 
     Parameters
     ----------
     temporary : path-like
         The file, on the same file system.
     path : path-like
-        Its name.
+        Final name.
     overwrite : bool
         Whether a file of this name may be replaced.
 
@@ -428,7 +428,7 @@ def place(temporary, path, *, overwrite):
         os.replace(temporary, path)
         return
     try:
-        # Unlike a rename, a link never replaces what someone else wrote in the meantime.
+        # Unlike a rename, a link never replaces a file written by others in the meantime.
         os.link(temporary, path)
     except FileExistsError:
         raise OutputExistsError(
@@ -443,7 +443,7 @@ def place(temporary, path, *, overwrite):
 
 @contextlib.contextmanager
 def atomic_path(path, *, overwrite=False):
-    """Write a file in one step: the block writes a temporary file, which then gets the name.
+    """Write a file atomically: the block writes a temporary file, which is then renamed.
 
     Parameters
     ----------
@@ -467,8 +467,8 @@ def atomic_path(path, *, overwrite=False):
     """
     path = Path(path)
     check_output(path, overwrite=overwrite)
-    # The ending stays, since writers choose their format by it.  Absolute, since to some of them a
-    # leading '~' is not a name.
+    # The suffix stays, because writers choose the format by it.  Absolute, because some of them
+    # expand a leading '~'.
     ending = path.suffix if len(os.fsencode(path.suffix)) <= _LONGEST_ENDING else ""
     temporary = path.parent.absolute() / f".{uuid.uuid4().hex}.part{ending}"
     try:

@@ -36,12 +36,12 @@ from wpdc_gwcs.solution import Calibration, DistortionSolution
 
 __all__ = ["read_fits", "warn_if_far", "write_form"]
 
-# What `cpdis` and `tab` promise, px.
+# Promised accuracy of `cpdis` and `tab`, px.
 _PROMISED_PX = 1e-3
 
 
 def write_form(obj, path, *, form, degree=None, overwrite=False):
-    """Write a calibration in one of the forms of FITS.
+    """Write a calibration in one of the FITS forms.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def write_form(obj, path, *, form, degree=None, overwrite=False):
     Returns
     -------
     made : `~wpdc_gwcs.export.FitsForm`
-        What was written, with its deviation.
+        The written form, with its deviation.
 
     Warns
     -----
@@ -68,16 +68,16 @@ def write_form(obj, path, *, form, degree=None, overwrite=False):
 
     Notes
     -----
-    ``tpv`` and ``sip`` are headers without an image.  Many readers want to know its size, so they
-    stand in front of an image of zeros, which takes no room on disk where the file system can leave
-    it out.  ``cpdis`` has the tables of ``fits`` as well, for an exact way back.
+    ``tpv`` and ``sip`` are headers without an image.  Many readers need its size, so an
+    image of zeros follows, which takes no space on file systems with sparse files.  ``cpdis`` also
+    has the tables of ``fits``, so that it can be read back exactly.
     """
     made = make_form(obj, form, degree=degree)
     warn_if_far(made, path)
     header = made.header.copy()
     header.extend(frame_cards(obj), strip=False, end=True)
     if made.deviation is not None:
-        add_history(header, f"greatest deviation from the exact WCS: {made.deviation:.3g} px")
+        add_history(header, f"largest deviation from the exact WCS: {made.deviation:.3g} px")
     if made.inverse_deviation is not None:
         add_history(header, f"that of the inverse polynomials: {made.inverse_deviation:.3g} px")
     if made.swarp_deviation is not None:
@@ -100,7 +100,7 @@ def write_form(obj, path, *, form, degree=None, overwrite=False):
 
 
 def warn_if_far(made, path):
-    """Warn where a form misses what it promises.
+    """Warn if a form is less accurate than promised.
 
     Parameters
     ----------
@@ -136,10 +136,10 @@ def _write_text(header, path, shape, overwrite):
 
 
 def _write_header(header, path, shape):
-    """Write a primary header and an image of zeros that is left out by the file system."""
+    """Write a primary header and an image of zeros as a sparse file."""
     primary = fits.PrimaryHDU(header=header)
     primary.data = np.broadcast_to(np.uint8(0), shape)
-    # Zeros add up to nothing: the sum is that of the header.
+    # The sum of zeros is zero, so the checksum is that of the header.
     primary.header["CHECKSUM"], primary.header["DATASUM"] = "0" * 16, "0"
     total = sum_words(primary.header.tostring().encode("ascii"))
     primary.header["CHECKSUM"] = checksum_text(total)
@@ -152,7 +152,7 @@ def _write_header(header, path, shape):
 
 
 def read_fits(path):
-    """Read a TAN, TPV or TAN + PV header, with our look-up table where there is one.
+    """Read a TAN, TPV or TAN + PV header, with our look-up table if there is one.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def read_fits(path):
     Returns
     -------
     calibration : `~wpdc_gwcs.Calibration`
-        CD0 is the CD of the header; ``image_shape`` is `None` where the header does not tell.
+        CD0 is the CD of the header; ``image_shape`` is `None` if the header does not tell.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def read_fits(path):
 def _read_own_tables(hdus, header, path):
     """Read the look-up table and the instrument of a header of this package.
 
-    A file that ends between two HDUs is whole to FITS, but these belong together.
+    A file cut between two HDUs is valid FITS, but these belong together.
     """
     version = header_number(header, "WPDCTAB", name=str(path), required=False, default=1)
     found = []
@@ -278,7 +278,7 @@ def _read_table(hdu, name):
             f"{name}: nodes must be a full grid with x running fastest, got {len(x)} rows with "
             f"{shape[1]} values of X_GRID and {shape[0]} of Y_GRID"
         )
-    # From one to zero; where the nodes are spaced as evenly as they can, so that they are again.
+    # From one-based to zero-based; nodes that are evenly spaced up to rounding become exactly so.
     grids = []
     for grid in (x_grid - 1.0, y_grid - 1.0):
         even = np.linspace(grid[0], grid[-1], len(grid))
@@ -307,7 +307,7 @@ def _read_instrument(hdu, name):
 
 
 def _agree(instrument, tan):
-    """Tell whether the keywords still say what the instrument says: they may have been edited."""
+    """Return whether the keywords agree with the instrument table: they may have been edited."""
     if instrument["pv"].degree != tan.pv.degree or instrument["pv"].radial != tan.pv.radial:
         return False
     folded = fold_attitude(instrument["pv"], np.linalg.solve(instrument["cd"].T, tan.cd.T).T)

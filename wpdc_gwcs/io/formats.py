@@ -1,4 +1,4 @@
-"""One way in and one way out for calibrations and solutions, whatever the format."""
+"""Reading and writing of calibrations and solutions in all formats."""
 
 import warnings
 from pathlib import Path
@@ -28,22 +28,22 @@ def read(path):
     ----------
     path : path-like
         ASDF file of this package; FITS file (or ``path[EXT]``), ``.head`` or other text file with a
-        TPV, TAN + PV or TAN header, with the look-up table of this package where there is one.
+        TPV, TAN + PV or TAN header, with the look-up table of this package if there is one.
 
     Returns
     -------
     obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or `~wpdc_gwcs.Camera`
-        With the fast, exactly invertible ``wcs``; a camera with the solutions of its detectors,
-        whose files must be where it says.
+        With the fast, exactly invertible ``wcs``; a camera includes the solutions of its detectors,
+        whose files must be at the paths that it names.
 
     Raises
     ------
     FileFormatError
-        If the file is missing, empty, damaged, of a newer format version, or something else.
+        If the file is missing, empty, damaged, of a newer format version, or of another kind.
 
     See Also
     --------
-    read_wcs : The WCS of any file that has one.
+    read_wcs : Read the WCS of any file that has one.
 
     Examples
     --------
@@ -64,7 +64,7 @@ def read(path):
 
 
 def read_wcs(source):
-    r"""Read the WCS of a file or header, of whatever kind.
+    r"""Read the WCS of a file or header of any kind.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def _wcs_of(header, name, path):
     if path is not None and file_kind(path) == "fits":
         from wpdc_gwcs.io.files import open_fits
 
-        # While a file is open, no warning is shown: ours are repeated when it is closed.
+        # Warnings are suppressed while a file is open: ours are repeated afterwards.
         with open_fits(path) as hdus, warnings.catch_warnings(record=True) as seen:
             warnings.simplefilter("always")
             wcs = parse_wcs(header, hdus=hdus, name=name)
@@ -133,27 +133,28 @@ def _wcs_of(header, name, path):
 
 
 def write(obj, path, *, format=None, degree=None, overwrite=False):
-    """Write a calibration, a solution or a table, in one step: the whole file or none.
+    """Write a calibration, a solution or a table, atomically.
 
     Parameters
     ----------
     obj : Calibration, DistortionSolution, Camera or `~astropy.table.Table`
-        What to write; in FITS formats, a solution stands about its nominal pointing.  A camera is
-        written as ``asdf`` only.
+        Object to write; FITS formats have a solution at its nominal pointing.  A camera is written
+        as ``asdf`` only.
     path : path-like
         File to write.
     format : {"asdf", "fits", "cpdis", "tpv", "head", "sip", "tab", "stock"}, optional
-        By default what the ending says: ``.asdf``, ``.fits``, ``.head``; ``.ecsv`` for tables.
+        By default from the suffix: ``.asdf``, ``.fits``, ``.head``; ``.ecsv`` for tables.
     degree : int, optional
         Degree of the polynomials of the FITS formats; by default that of the solution for ``fits``
-        and ``cpdis``, the lowest that is good to 1e-3 px or nearly as good as any for the others.
+        and ``cpdis``, for the others the lowest that is accurate to 1e-3 px, or
+        nearly as accurate as any.
     overwrite : bool, optional
         Whether an existing file may be replaced.
 
     Returns
     -------
     deviation : float or None
-        Greatest deviation from the exact WCS over the detector, px; `None` for the exact formats,
+        Largest deviation from the exact WCS over the detector, px; `None` for the exact formats,
         ``asdf`` and ``fits`` without ``degree``.
 
     Raises
@@ -184,7 +185,7 @@ def write(obj, path, *, format=None, degree=None, overwrite=False):
         raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {format!r} for {path}")
     if isinstance(obj, Camera) and format != "asdf":
         raise ValueError(f"a camera is written as 'asdf', got the format {format!r} for {path}")
-    # Before the work, not after.
+    # Check before the work, not after.
     check_output(path, overwrite=overwrite)
     if format in FORMS:
         from wpdc_gwcs.io.fits import write_form
@@ -193,7 +194,7 @@ def write(obj, path, *, format=None, degree=None, overwrite=False):
         return made.deviation
     if degree is not None:
         raise ValueError(f"degree has no meaning for {format!r}, got {degree}")
-    # asdf and gwcs take half a second to import: only where they are needed.
+    # asdf and gwcs take half a second to import: only when needed.
     from wpdc_gwcs.io import asdf
 
     writer = {"asdf": asdf.write_asdf, "stock": asdf.write_stock}[format]

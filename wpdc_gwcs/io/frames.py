@@ -75,7 +75,7 @@ from wpdc_gwcs.io.sources import (
 
 __all__ = ["read_frames"]
 
-# Companions that tell the noise of the sky, best first.
+# Companions with the noise of the sky, best first.
 _WEIGHTS = ("weight", "error", "variance")
 
 
@@ -246,7 +246,7 @@ def _given_headers(wcs):
 
 
 def _choose(hdus, path, extension, *, quiet=False):
-    """Which HDUs are frames: list of (kind, index), and what goes with the images."""
+    """Find the HDUs that are frames, as (kind, index), and the companions of images."""
     lists = [i for i, hdu in enumerate(hdus) if hdu.name == "LDAC_OBJECTS"]
     images = [
         i for i, hdu in enumerate(hdus) if hdu.is_image and image_shape(hdu.header) is not None
@@ -270,10 +270,10 @@ def _choose(hdus, path, extension, *, quiet=False):
         return [("list", i) for i in lists], {}
     images = list(companions)
     if len(images) > 1:
-        # Of several images, those without a WCS are something else (guiders, focus chips).
+        # Among several images, those without a WCS are not frames (guiders, focus chips).
         images = [i for i in images if "CTYPE1" in hdus[i].header] or images[:1]
     if images:
-        # Cubes beside images are something else too.
+        # Cubes next to images are not frames either.
         flat = [i for i in images if planes_of(hdus[i].header) == 1]
         return [("image", i) for i in flat or images], companions
     sources = [i for i in tables if position_columns(hdus[i].columns.names) is not None]
@@ -288,14 +288,14 @@ def _choose(hdus, path, extension, *, quiet=False):
 
 
 def _refuse_planes(where, given):
-    """Refuse masks and weights of what has no pixels."""
+    """Raise an error for masks and weights of a source list."""
     for path in given.values():
         if path is not None:
             raise FrameError(f"{where}: is a source list, for which {path} is of no use")
 
 
 def _companions(part, companions, given, beside):
-    """Gather what goes with a frame: the planes given, else those of its own file and beside."""
+    """Collect the companions of a frame: given ones, else those in its file or next to it."""
     found = list(companions.get(part["index"], ()))
     if part["kind"] == "image":
         found += [map_beside(p, part["index"], part["label"], part["shape"]) for p in beside]
@@ -308,7 +308,7 @@ def _companions(part, companions, given, beside):
 
 
 def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
-    """Everything that needs the open file: headers, WCS, names of columns."""
+    """Read everything that needs the open file: headers, WCS, names of columns."""
     hdu = hdus[index]
     header = hdu.header
     if kind == "list":
@@ -316,7 +316,7 @@ def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
     # Keywords of the whole file stand in the primary header.
     headers = [header.copy()] + ([hdus[0].header.copy()] if index > 0 else [])
     if kind == "table" and given is not None:
-        # A bare table says nothing of the exposure.
+        # The header of a bare table does not describe the exposure.
         headers.append(given)
     if kind != "image":
         names = hdu.columns.names
@@ -348,7 +348,7 @@ def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
             # Other planes of the cube may be frames of the same run.
             chosen = [f"p{plane}"]
         plane = choose_plane(header, plane, f"{where}" if "[" in where else f"{where}[{index}]")
-    # While a file is open, no warning is shown: ours are repeated when it is closed.
+    # Warnings are suppressed while a file is open: ours are repeated afterwards.
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
         parsed = parse_wcs(
@@ -377,7 +377,7 @@ def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
 
 
 def _ldac_header(hdus, index, where):
-    """Give the image header that a FITS_LDAC file carries as a table of one string."""
+    """Return the image header that a FITS_LDAC file carries as a table of one string."""
     if index == 0 or hdus[index - 1].name != "LDAC_IMHEAD":
         raise FrameError(f"{where}: LDAC_OBJECTS must follow LDAC_IMHEAD")
     try:
@@ -421,7 +421,7 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
 
 
 def _choices(part, path):
-    """State what of the file the frame is made of, where there was a choice."""
+    """Describe the choices that were made to get the frame from the file."""
     if part["kind"] == "table":
         return _first_pixel(part["origin"])
     if part["kind"] == "list":

@@ -1,4 +1,4 @@
-"""What FITS headers say: cards, values, shapes; the WCS is read in `tan` and `celestial`."""
+"""FITS headers: cards, values, shapes; for the WCS see `tan` and `celestial`."""
 
 import math
 import re
@@ -72,7 +72,7 @@ def read_headers(path):
     Returns
     -------
     headers : list of `~astropy.io.fits.Header`
-        Headers with a ``CTYPE1``, in the order of the file; copies that live on without the file.
+        Headers with a ``CTYPE1``, in the order of the file; independent copies.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def read_headers(path):
                 chosen = [hdus[find_extension(hdus, extension, path)]]
             headers = [hdu.header.copy() for hdu in chosen]
     else:
-        # Some keep the 80-byte cards of FITS in a file without line ends: the same thing to read.
+        # Files with 80-byte cards without line ends are read the same way.
         headers = clean_header(path.read_bytes())
         if extension is not None:
             if not isinstance(extension, int) or not 0 <= extension < len(headers):
@@ -110,9 +110,9 @@ def find_extension(hdus, extension, path, *, error=FileFormatError):
     hdus : `~astropy.io.fits.HDUList`
         The open file.
     extension : int or str
-        What stood in the brackets.
+        Text in the brackets.
     path : path-like
-        For messages.
+        Path for messages.
     error : type, optional
         Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
 
@@ -158,7 +158,7 @@ def extension_names(hdus):
 
 
 def header_text(header, key):
-    """Give a keyword as stripped text, an empty one if it is absent, blank or broken.
+    """Return a keyword as stripped text, an empty one if it is absent, blank or broken.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def header_text(header, key):
 
 
 def header_value(header, key):
-    """Give the value of a keyword.
+    """Return the value of a keyword.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def header_value(header, key):
 def header_number(
     header, key, *, name="header", required=True, default=None, error=FileFormatError
 ):
-    """Give a keyword as a finite number.
+    """Return a keyword as a finite number.
 
     Parameters
     ----------
@@ -214,11 +214,11 @@ def header_number(
     key : str
         Keyword.
     name : str, optional
-        What messages call the header.
+        Name of the header in messages.
     required : bool, optional
         Whether the card must be there.
     default : float, optional
-        Given for an absent card that is not required.
+        Value for an absent card that is not required.
     error : type, optional
         Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
 
@@ -244,7 +244,7 @@ def header_number(
 
 
 def is_ours(header):
-    """Tell whether a header was written by this package to be read back.
+    """Return whether a header was written by this package to be read back.
 
     Parameters
     ----------
@@ -254,18 +254,18 @@ def is_ours(header):
     Returns
     -------
     bool
-        By any of the keywords that say so: damage to one does not make it another's.
+        True if any of the keywords of this package is present, even if others are damaged.
     """
     return "WPDCVERS" in header or "WPDCTAB" in header
 
 
 def positive_number(headers, keys):
-    """Give the first positive finite number among some keywords.
+    """Return the first positive finite number among some keywords.
 
     Parameters
     ----------
     headers : sequence of `~astropy.io.fits.Header`
-        Looked through in turn.
+        Searched in turn.
     keys : sequence of str
         Keywords, best first.
 
@@ -288,12 +288,12 @@ def positive_number(headers, keys):
 
 
 def header_shape(header):
-    """Give the shape of the image a header belongs to.
+    """Return the shape of the image a header belongs to.
 
     Parameters
     ----------
     header : `~astropy.io.fits.Header`
-        The header; of a tile-compressed image or of astrometry.net as well.
+        The header, also of a tile-compressed image or from astrometry.net.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Who a frame is: its detector, camera and exposure, and names that differ within a file."""
+"""Identity of a frame: detector, camera, exposure, and unique names within a file."""
 
 import re
 from dataclasses import replace
@@ -31,23 +31,23 @@ _DETECTOR_KEYS = (
     "IMAGEID",
 )
 _FACTS = {"filter": ("FILTER", "FILTER1", "BAND"), "object": ("OBJECT",), "date": ("DATE-OBS",)}
-# Camera of frames that are tied to others and do not name theirs.
+# Camera of frames that are tied to others but do not name it.
 _CAMERA = "camera"
-#: Names of extensions that name nothing.
+#: Generic names of extensions.
 NOT_NAMES = ("PRIMARY", "COMPRESSED_IMAGE", "")
 
 
 def exposure_keys(headers, exposure_keyword, where, chosen=()):
-    """Find camera and exposure; a frame that does not tell its camera is on its own.
+    """Find camera and exposure; a frame without a camera is on its own.
 
     Parameters
     ----------
     headers : list of `~astropy.io.fits.Header`
-        That of the frame first, then that of its file.
+        Header of the frame first, then that of its file.
     exposure_keyword : str or None
-        Keyword whose value is the exposure; `None` for the usual ones.
+        Keyword that identifies the exposure; `None` for the usual ones.
     where : str
-        What messages call the frame.
+        Name of the frame in messages.
     chosen : list of str, optional
         Words for the plane of a cube.
 
@@ -58,7 +58,7 @@ def exposure_keys(headers, exposure_keyword, where, chosen=()):
     """
     exposure = exposure_key(headers, keyword=exposure_keyword, name=where)
     if exposure is not None and chosen:
-        # Planes of a cube are of one detector, and so of different exposures.
+        # Planes of a cube are from one detector, and so from different exposures.
         exposure = "_".join([exposure, *chosen])
     camera = camera_key(headers)
     if camera is None and exposure_keyword is not None:
@@ -67,7 +67,7 @@ def exposure_keys(headers, exposure_keyword, where, chosen=()):
 
 
 def on_its_own(frame):
-    """Give a frame that no other belongs to.
+    """Return a frame that is not tied to others.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def on_its_own(frame):
     Returns
     -------
     Frame
-        The same without camera and exposure.
+        The frame without camera and exposure.
     """
     return replace(frame, camera=None, exposure=None)
 
@@ -85,7 +85,7 @@ def on_its_own(frame):
 def of_one_exposure(frames, parts, path):
     """Tie the frames of a file, unless identifiers say that they are different exposures.
 
-    Their times need not be the same: each detector may have written its own.
+    Their times may differ: each detector may have its own.
 
     Parameters
     ----------
@@ -115,14 +115,14 @@ def detector_name(headers):
     Parameters
     ----------
     headers : list of `~astropy.io.fits.Header`
-        That of the frame first, then that of its file.
+        Header of the frame first, then that of its file.
 
     Returns
     -------
     str
-        "detector" where none is named.
+        Name of the detector, or "detector".
     """
-    # The primary header describes the whole camera: it has no say where the frame's own names one.
+    # The primary header describes the whole camera; the header of the frame takes precedence.
     for header in headers:
         for key in _DETECTOR_KEYS:
             text = header_text(header, key)
@@ -137,12 +137,12 @@ def header_facts(headers):
     Parameters
     ----------
     headers : list of `~astropy.io.fits.Header`
-        That of the frame first, then that of its file.
+        Header of the frame first, then that of its file.
 
     Returns
     -------
     dict
-        ``filter``, ``object``, ``date``, ``exptime`` in s, ``start`` as MJD: those that are there.
+        ``filter``, ``object``, ``date``, ``exptime`` in s, ``start`` as MJD: those that are known.
     """
     facts = {}
     for fact, keys in _FACTS.items():
@@ -157,7 +157,7 @@ def header_facts(headers):
 
 
 def distinct(frames, parts):
-    """Make names of frames and detectors of one file differ.
+    """Make the names of frames and detectors of a file unique.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def distinct(frames, parts):
     Returns
     -------
     list of Frame
-        The same, with numbers in their names where these were alike.
+        The frames, with numbers appended to names that were the same.
     """
     if len(frames) < 2:
         return frames
@@ -191,7 +191,7 @@ def distinct(frames, parts):
 
 
 def file_name(text):
-    """Make a text part of a file's name.
+    """Make a text usable in a file name.
 
     Parameters
     ----------
@@ -201,6 +201,6 @@ def file_name(text):
     Returns
     -------
     str
-        With underscores for all that file systems may not like.
+        The text, with underscores for characters that file systems may reject.
     """
     return re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_") or "image"

@@ -30,7 +30,7 @@ __all__ = [
     "split_plane",
 ]
 
-# What stands for the sum of all planes in path[EXT][plane].
+# Symbol for the sum of all planes in path[EXT][plane].
 LUMINANCE = "L"
 
 _GAIN_KEYS = ("GAIN", "EGAIN", "GAINA", "CCDGAIN", "ATODGAIN", "HIERARCH ESO DET OUT1 CONAD")
@@ -55,7 +55,7 @@ _RATE = re.compile(
     re.IGNORECASE,
 )
 
-# Cards that tell that three planes are colors.
+# Cards that mark three planes as colors.
 _COLOR_KEYS = re.compile(r"COLOU?R|CSPACE|BAYER|CFA")
 _COLOR_TEXT = re.compile(r"\b(RGB|sRGB|BAYER|COLOU?R)\b", re.IGNORECASE)
 
@@ -73,7 +73,7 @@ def split_plane(path):
     path : str or path-like
         Without the plane.
     plane : int or str or None
-        Number counted from zero, ``L`` for all planes together, `None` where none was given.
+        Number counted from zero, ``L`` for all planes together, `None` if none was given.
     """
     match = re.fullmatch(r"(.+\[[^\[\]]+\])\[(\d+|[Ll])\]", str(path))
     if match is None:
@@ -83,7 +83,7 @@ def split_plane(path):
 
 
 def image_shape(header):
-    """Shape of an image, of a cube that of its planes.
+    """Return the shape of an image, or of the planes of a cube.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def image_shape(header):
     Returns
     -------
     (int, int) or None
-        ``(ny, nx)``; `None` where there are no pixels.
+        ``(ny, nx)``; `None` if there are no pixels.
     """
     axes = _axes(header)
     if len(axes) < 2 or min(axes) < 1:
@@ -118,14 +118,14 @@ def planes_of(header):
 
 
 def choose_plane(header, plane, where):
-    """Decide which plane of an image is measured.
+    """Choose the plane of an image to measure.
 
     Parameters
     ----------
     header : `~astropy.io.fits.Header`
         Header of the extension.
     plane : int or str or None
-        What the user chose.
+        Choice of the user.
     where : str
         For messages: ``path[EXT]``.
 
@@ -183,12 +183,12 @@ def image_gain(headers):
     Parameters
     ----------
     headers : sequence of `~astropy.io.fits.Header`
-        Of the extension and of the file.
+        Headers of the extension and of the file.
 
     Returns
     -------
     float or None
-        `None` where the header does not tell.
+        `None` if the header does not tell.
     """
     gain = positive_number(headers, _GAIN_KEYS)
     unit = next((t for h in headers if (t := header_text(h, "BUNIT"))), "").strip()
@@ -199,7 +199,7 @@ def image_gain(headers):
         return time
     if _COUNTS.match(unit):
         return None if gain is None or time is None else gain * time
-    # Fluxes and surface brightnesses have nothing to do with the detector's counts.
+    # Fluxes and surface brightnesses do not tell counts.
     return None if _is_physical(unit) else gain
 
 
@@ -212,33 +212,33 @@ def _is_physical(text):
 
 
 def image_read_noise(headers):
-    """Read the noise of the readout.
+    """Find the read noise.
 
     Parameters
     ----------
     headers : sequence of `~astropy.io.fits.Header`
-        Of the extension and of the file.
+        Headers of the extension and of the file.
 
     Returns
     -------
     float or None
-        In electrons; `None` where the header does not tell.
+        Read noise in electrons; `None` if the header does not tell.
     """
     return positive_number(headers, _READ_NOISE_KEYS)
 
 
 def image_saturation(headers):
-    """Read the counts from which pixels are saturated.
+    """Find the counts above which pixels are saturated.
 
     Parameters
     ----------
     headers : sequence of `~astropy.io.fits.Header`
-        Of the extension and of the file.
+        Headers of the extension and of the file.
 
     Returns
     -------
     float or None
-        `None` where the header does not tell.
+        `None` if the header does not tell.
     """
     return positive_number(headers, _SATURATION_KEYS)
 

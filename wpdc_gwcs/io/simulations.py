@@ -130,7 +130,7 @@ def write_simulation(
     -------
     dict
         ``"reference"``: path of the catalog; ``"frames"``: list with one path per exposure, image
-        or source list; ``"headers"``: list of paths of the text headers, `None` where the frame has
+        or source list; ``"headers"``: list of paths of the text headers, `None` if the frame has
         its own; ``"truth"``: path of the exact WCSs, beside tables of the stars of each frame.
 
     Raises

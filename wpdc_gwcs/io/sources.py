@@ -121,7 +121,7 @@ def position_columns(names):
     Returns
     -------
     (str, str, int or None) or None
-        Names of x and y as they are spelled, and the number of the first pixel, `None` where the
+        Names of x and y as they are spelled, and the number of the first pixel, `None` if the
         names do not tell; `None` if there are no such columns.
     """
     spelled = spelled_names(names)
@@ -151,7 +151,7 @@ def source_origin(names, headers=(), texts=()):
     Returns
     -------
     int or None
-        0 or 1; `None` where nothing tells.
+        0 or 1; `None` if nothing tells.
     """
     found = position_columns(names)
     if found is not None and found[2] is not None:
@@ -286,7 +286,7 @@ def standardize_sources(table, *, name="sources", origin=None):
     table : mapping
         Table or dictionary of columns, with this package's, photutils' or SExtractor's names.
     name : str, optional
-        What messages call it.
+        Name of it in messages.
     origin : int, optional
         Number of the first pixel; by default as the columns' names tell, else 0.
 

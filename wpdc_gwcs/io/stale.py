@@ -33,7 +33,7 @@ _HISTORY = "WCS by wpdc_gwcs"
 
 
 def is_stale(card, alternates):
-    """Tell whether a card goes when another primary WCS comes.
+    """Return whether a card goes when another primary WCS comes.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def is_stale(card, alternates):
 
 
 def alternates_of(header):
-    """Give the letters of the alternate WCSs of a header, and of those that use SIP terms.
+    """Return the letters of the alternate WCSs of a header, and of those that use SIP terms.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def alternates_of(header):
 
 
 def tables_of(header):
-    """Give the extensions that the primary WCS of a header refers to.
+    """Return the extensions that the primary WCS of a header refers to.
 
     Parameters
     ----------

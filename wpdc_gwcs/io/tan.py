@@ -100,7 +100,7 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
     header : `~astropy.io.fits.Header`
         Header with CD, PC + CDELT or CDELT + CROTA; axes in either order.
     name : str, optional
-        What messages call the header.
+        Name of the header in messages.
     error : type, optional
         Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
     ignore_tables : bool, optional
@@ -183,7 +183,7 @@ def require_place(longitude, latitude, name, error):
     longitude, latitude : float
         ``CRVAL``, deg.
     name : str
-        What messages call the header.
+        Name of the header in messages.
     error : type
         Class of the error.
 
@@ -211,7 +211,7 @@ def _require_area(pv, cd, crpix, shape, name, error):
 
 
 def idle_pv(header):
-    """Tell whether all PV cards of a TAN header are zero, and so say nothing.
+    """Return whether all PV cards of a TAN header are zero, and so say nothing.
 
     Parameters
     ----------

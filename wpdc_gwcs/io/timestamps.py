@@ -18,7 +18,7 @@ class Timestamp:
     has_time : bool
         Whether the time of day is known.
     system : str or None
-        Time system that the text names, ``UTC`` where it has a zone; `None` where it names none.
+        Time system that the text names, ``UTC`` where it has a zone; `None` if it names none.
     """
 
     mjd: float
@@ -146,7 +146,7 @@ def read_timestamp(text):
 
 
 def _day(parts, *, day_first):
-    """Give the modified Julian date of a day, `None` if there is no such day."""
+    """Return the modified Julian date of a day, `None` if there is no such day."""
     year = int(parts["y"])
     if len(parts["y"]) == 2:
         year += 1900 if year >= _FIRST_YEAR else 2000

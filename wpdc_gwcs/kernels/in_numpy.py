@@ -418,7 +418,7 @@ def to_sky(plane, cells, tangent, box, x, y, ra, dec):
     tangent : (9,) ndarray
         Tangent point, see `tangent_numbers`.
     box : (5,) ndarray or None
-        Least and greatest x, least and greatest y, and what points outside become.
+        Smallest and largest x, smallest and largest y, and what points outside become.
     x, y : (N,) ndarray
         Pixels.
     ra, dec : (N,) ndarray
@@ -563,7 +563,7 @@ def invert(plane, start, limits, tangent, box, a, b, x, y):
     tangent : (9,) ndarray or None
         If given, a and b are positions on the sky, see `from_sky`.
     box : (5,) ndarray or None
-        Least and greatest x, least and greatest y, and what answers outside become.
+        Smallest and largest x, smallest and largest y, and what answers outside become.
     a, b : (N,) ndarray
         Images to invert.
     x, y : (N,) ndarray

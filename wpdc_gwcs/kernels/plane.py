@@ -105,9 +105,9 @@ def box_numbers(box, fill_value):
     Parameters
     ----------
     box : ((float, float), (float, float)) or None
-        Least and greatest x, least and greatest y.
+        Smallest and largest x, smallest and largest y.
     fill_value : float
-        What points outside become.
+        Value of points outside.
 
     Returns
     -------

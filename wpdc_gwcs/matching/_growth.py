@@ -141,7 +141,7 @@ def grow_locally(problem, points, limit, fit, pairs):
 
 
 def final_radius(problem, mapped, pairs, scatter, leverage):
-    """Give the radius of every source from its own error and that of the mapping there."""
+    """Return the radius of every source from its own error and that of the mapping there."""
     if problem.errors is None:
         own = np.full(len(mapped), scatter)
     else:
@@ -158,7 +158,7 @@ def final_radius(problem, mapped, pairs, scatter, leverage):
 
 
 def growing_radius(fit, leverage):
-    """Give the radius while the mapping grows, from its scatter and uncertainty there."""
+    """Return the radius while the mapping grows, from its scatter and uncertainty there."""
     return _GROW_RADIUS * fit.scatter * np.sqrt(1 + leverage)
 
 
@@ -196,6 +196,6 @@ def _count_net(grown, reference):
 
 
 def _are_alike(pairs, others):
-    """Tell whether two sets of pairs differ by next to nothing."""
+    """Return whether two sets of pairs differ by next to nothing."""
     a, b = (i * (1 << 32) + j for i, j in (pairs, others))
     return 2 * len(np.intersect1d(a, b, assume_unique=True)) >= _ALIKE * (len(a) + len(b))

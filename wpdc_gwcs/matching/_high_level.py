@@ -255,7 +255,7 @@ def _find_shape(wcs, x, y):
 
 
 def _tangent_plane(wcs, image_shape):
-    """Give the linear map of the plane that touches the WCS in the center of the frame.
+    """Return the linear map of the plane that touches the WCS in the center of the frame.
 
     Returns a function from RA and Dec to pixels.
     """

@@ -62,7 +62,7 @@ class Seed:
         return first_pairs(self.sources, self.reference, self.hypotheses, self.n_near)
 
     def rows(self, pairs):
-        """Give the rows of the whole lists for pairs of the seed's own."""
+        """Return the rows of the whole lists for pairs of the seed's own."""
         return self.source_rows[pairs[0]], self.reference_rows[pairs[1]]
 
 

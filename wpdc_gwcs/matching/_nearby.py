@@ -227,7 +227,7 @@ def _peaks(sources, reference, max_shift, max_bend):
 
 
 def _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend):
-    """Grow a linear mapping from a shift, within bounds; `None` where it does not hold."""
+    """Grow a linear mapping from a shift, within bounds; `None` if it does not hold."""
     linear = np.zeros((3, 2))
     linear[0] = shift
     radius, scatter, before = reach, reach, None

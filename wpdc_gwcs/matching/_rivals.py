@@ -37,7 +37,7 @@ def find_rival_offset(mapped, partner, tree, radius, *, center, max_offset):
     Returns
     -------
     (2,) ndarray or None
-        The offset, px, or `None` where no other one suits half of the sources.
+        The offset, px, or `None` if no other one suits half of the sources.
 
     Notes
     -----

@@ -174,7 +174,7 @@ def _judge_few(problem, points, mapped, radius, leverage, terms, pairs):
 
 
 def is_explained(problem, match, i, j):
-    """Tell whether most of some candidate pairs agree with a match to within a few radii."""
+    """Return whether most of some candidate pairs agree with a match to within a few radii."""
     gap = np.hypot(*(match.mapped[i] - problem.stars.points[j]).T)
     return np.mean(gap <= _EXPLAINED * match.radius[i]) > _MOST
 

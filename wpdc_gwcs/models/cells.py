@@ -97,7 +97,7 @@ class CellGrid:
         return kernels.arranged(self.table, kernels.CELL_ORDER)
 
     def covers(self, x, y):
-        """Tell whether all points lie inside the cells.
+        """Return whether all points lie inside the cells.
 
         Parameters
         ----------

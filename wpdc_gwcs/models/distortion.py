@@ -324,7 +324,7 @@ class DetectorToSky(Model):
         Parameters
         ----------
         box : ((float, float), (float, float)), optional
-            Least and greatest x, least and greatest y.
+            Smallest and largest x, smallest and largest y.
         fill_value : float, optional
             What points outside the box are mapped to.
 
@@ -402,8 +402,8 @@ class SkyToDetector(Model):
         Parameters
         ----------
         box : ((float, float), (float, float)), optional
-            Least and greatest x, least and greatest y.  Answers within 1e-6 px outside are put on
-            its rim.
+            Smallest and largest x, smallest and largest y.  Solutions up to 1e-6 px outside are
+            moved to its edge.
         fill_value : float, optional
             What both coordinates of points outside the box become, and those without an answer.
 

@@ -174,8 +174,8 @@ class PlaneMap:
         tangent : (9,) ndarray, optional
             If given, positions on the sky are inverted, see `~wpdc_gwcs.kernels.tangent_numbers`.
         box : ((float, float), (float, float)), optional
-            Least and greatest x, least and greatest y: answers within 1e-6 px outside are put on
-            its rim, what is farther out is no answer.
+            Smallest and largest x, smallest and largest y.  Solutions up to 1e-6 px outside are
+            moved to its edge; those farther out are not accepted.
         fill_value : float, optional
             What both coordinates of an answer outside the box become, and without an answer.
 

@@ -362,7 +362,7 @@ class SkyTangent(_Linear):
 
 
 def local_plane(sky, x, y, *, step=1.0):
-    """Give the linear map and the tangent point of a WCS at a pixel.
+    """Return the linear map and the tangent point of a WCS at a pixel.
 
     Parameters
     ----------

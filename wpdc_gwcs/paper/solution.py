@@ -135,7 +135,7 @@ def solve_literally(
 
 
 def _detector(name, polynomials, stars, table, image_shape, n_grid, settings):
-    """Give what the exposures of a detector have in common: the table and the mean polynomial."""
+    """Return what the exposures of a detector have in common: the table and the mean polynomial."""
     first = polynomials[0]
     crpix, degree = first.crpix, settings["degree"]
     ny, nx = image_shape
@@ -245,7 +245,7 @@ def _diagonal(variance):
 
 
 def _rejected(exposure, reason):
-    """Give an exposure that could not be solved back as it was."""
+    """Return an exposure that could not be solved back as it was."""
     n = len(exposure.x)
     nothing = np.full(n, np.nan)
     return ExposureFit(

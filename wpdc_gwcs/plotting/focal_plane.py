@@ -123,7 +123,7 @@ def _of_camera(camera):
 
 
 def _of_frames(calibrations):
-    """Give the same of frames, in the plane of the first one about the middle of all."""
+    """Return the same for frames, in the plane of the first one about the middle of all."""
     calibrations = list(calibrations)
     if not calibrations:
         raise ValueError("a focal plane needs one detector at least")

@@ -238,7 +238,7 @@ def _stars(matches):
 
 
 def _stated(residuals):
-    """Magnitude and stated error of the stars of all tables; `None` where one has none."""
+    """Magnitude and stated error of the stars of all tables; `None` if one has none."""
     parts = []
     for table in as_tables(residuals):
         if not {"x_err", "y_err"} <= set(table.colnames):
@@ -250,7 +250,7 @@ def _stated(residuals):
 
 
 def _numbers(value, width):
-    """Give the bin of each star, and the centers of all, which begin at multiples of the width."""
+    """Return the bin of each star and the bin centers; bins begin at multiples of the width."""
     first = np.floor(value.min() / width)
     number = (np.floor(value / width) - first).astype(int)
     return number, (first + np.arange(number.max() + 1) + 0.5) * width

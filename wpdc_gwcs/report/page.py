@@ -179,7 +179,7 @@ def _contents(sections, ids, about):
 
 
 def _pool(tables):
-    """Give the matches of all frames of a detector in one table, or `None`."""
+    """Return the matches of all frames of a detector in one table, or `None`."""
     plain = []
     for table in tables:
         columns = [name for name in _POOLED if name in table.colnames]

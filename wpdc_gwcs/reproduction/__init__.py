@@ -1,4 +1,4 @@
-"""The paper, reproduced: its tables and figures, made of public functions alone."""
+"""Reproduction of the tables and figures of the paper, with public functions only."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ __all__ = [
     "tabulate_results",
 ]
 
-#: Name of a part to the function that makes it.
+#: Functions that make the parts, by name.
 PARTS = {
     "detectors": reproduce_detectors,
     "cluster": reproduce_cluster,
@@ -48,17 +48,17 @@ def reproduce(parts, folder, *, scale=FULL, seed=SEED, jobs=1, overwrite=False, 
     Parameters
     ----------
     parts : sequence of str
-        Names of the parts, of `PARTS`.
+        Names of parts, from `PARTS`.
     folder : path-like
-        Where tables and figures go, made if needed, each part into a folder of its own.
+        Folder for tables and figures, created if needed; each part has its own subfolder.
     scale : Scale, optional
-        How large it is: `FULL`, as the paper, or `QUICK`.
+        Size of the reproduction: `FULL`, as in the paper, or `QUICK`.
     seed : int, optional
-        Another seed, another camera; the numbers of the documentation are of `SEED`.
+        Random seed; the numbers in the documentation are for `SEED`.
     jobs : int, optional
-        Processes in which frames are matched.
+        Number of processes that match frames.
     overwrite : bool, optional
-        Whether an earlier reproduction there may be replaced.
+        Whether an earlier reproduction in this folder may be replaced.
     progress : callable, optional
         Called as ``progress(part, done, total)``.
 

@@ -1,11 +1,11 @@
-"""BASS: four chips about a reference point between them, Gaia's epoch to 2017.33, figure 10.
+"""BASS: four chips around a common reference point, at epoch 2017.33; figure 10.
 
 ::
 
     simulate --10 exposures of 4 chips----> calibrate --> pool_residuals, plot_sky_offsets
-    real headers --the same of one chip-->      literal: a weighted cubic of each exposure, no table
+    real headers --the same for one chip-->     literal: a weighted cubic per exposure, no table
                                                 ours: the default, and its cubic alone
-                                            scamp: where it is installed
+                                            scamp: if it is installed
 """
 
 import warnings
@@ -26,21 +26,21 @@ from wpdc_gwcs.simulation import simulate
 
 __all__ = ["reproduce_bass"]
 
-# Where the paper's exposures point.
+# Pointing of the paper's exposures.
 _CENTER = SkyCoord(278.8, 40.0, unit="deg")
-# Stars per square arcmin that leave about as many on a chip as the paper has: 49,158 on 40 images.
+# Stars per square arcmin: about as many per chip as in the paper (49,158 on 40 images).
 _DENSITY = 1.5
-# What the paper has is a cubic alone, about the matched source nearest to the center.
+# The paper uses a cubic alone, about the matched source nearest to the center.
 _RUNS = {
     "literal": {"method": "paper", "lut": "none"},
     "cubic": {"lut": "none"},
     "ours": {},
 }
-# Within this radius of a real chip all stars weigh the same, px (section 4.2).
+# Radius within which all stars of a real chip have the same weight, px (section 4.2).
 _R0 = 2000.0
 _MOMENTS = ("mean_alpha", "sigma_alpha", "mean_delta", "sigma_delta")
 _SCAMP = "scamp"
-# BASS was solved by SCAMP with polynomials of this degree (section 1 of the paper).
+# Degree of the SCAMP polynomials of BASS (section 1 of the paper).
 _SCAMP_DEGREE = 4
 _MAS = 3.6e6  # per deg
 
@@ -51,31 +51,30 @@ def reproduce_bass(folder, scale, *, seed=SEED, jobs=1, progress=None):
     Parameters
     ----------
     folder : Path
-        Where figures go; it must exist.
+        Existing folder for the figures.
     scale : Scale
-        How large it is.
+        Size of the reproduction.
     seed : int, optional
-        Of the camera and of the field.
+        Seed of the camera and of the field.
     jobs : int, optional
-        Processes in which frames are matched.
+        Number of processes that match frames.
     progress : callable, optional
         Called as ``progress("bass", done, total)``.
 
     Returns
     -------
     `~astropy.table.QTable`
-        See `~wpdc_gwcs.reproduction.results.tabulate_results`.  Items are "all", the default
-        against the literal cubic, and "cubic", where both have no table, of four chips with
-        distortions of their own; "scamp", where ``ours`` is what SCAMP gives here, if it is
-        installed; and "HEADER" and "HEADER cubic" for each real header of 90Prime, if there are
-        any.  ``wcs_alpha`` and ``wcs_delta`` are the error of the WCS itself, without the noise of
-        centroids.
+        See `~wpdc_gwcs.reproduction.results.tabulate_results`.  The items are: "all", the default
+        compared with the literal cubic, and "cubic", both without a table, for four chips with
+        different distortions; "scamp", where ``ours`` is the result of SCAMP, if it is installed;
+        and "HEADER" and "HEADER cubic" for each real header of 90Prime, if there are any.
+        ``wcs_alpha`` and ``wcs_delta`` are the errors of the WCS itself, without centroid noise.
 
     Notes
     -----
-    Headers are looked for under the folder that the environment variable ``WPDC_GWCS_DATA`` names.
+    Headers are searched in the folder given by the environment variable ``WPDC_GWCS_DATA``.
     Writes ``sky-offsets-literal.png``, ``sky-offsets-cubic.png``, ``sky-offsets-ours.png`` and,
-    where it is installed, ``sky-offsets-scamp.png``.
+    if SCAMP is installed, ``sky-offsets-scamp.png``.
     """
     headers = find_headers()[: scale.n_headers]
     steps = 1 + len(headers)
@@ -147,7 +146,7 @@ def _side_by_side(numbers, full, cubic):
 
 
 def _hold_against(solved, simulation, run):
-    """Residuals of our pairs with the WCSs of SCAMP, and what they come to."""
+    """Residuals of our pairs in the WCSs of SCAMP, and their statistics."""
     found, offsets = [], []
     for c in run.calibrations:
         table = c.matches.copy()

@@ -1,4 +1,4 @@
-"""Centroids of a rendered image against magnitude, with the photon limit: figure 2.
+"""Centroid residuals on rendered images against magnitude, with the photon limit: figure 2.
 
 ::
 
@@ -19,17 +19,17 @@ from wpdc_gwcs.simulation import simulate
 __all__ = ["measure_against_truth", "photon_limit", "reproduce_centroids"]
 
 _DETECTOR = "g-1"
-# The paper's stars reach beyond 25 mag.
+# Faintest magnitude; the stars of the paper reach beyond 25 mag.
 _MAGNITUDES = (17.0, 25.5)
-# What the paper gives numbers of.
+# Magnitudes for which the paper gives numbers.
 _BINS = {"g < 20": (-np.inf, 20.0), "g = 25": (24.75, 25.25)}
-# A source is a star that is this near, px, and that has no other star within the second distance,
-# which light from there would move.
+# A source is identified with a star within the first distance, px, if no other star is within the
+# second distance, where its light would shift the centroid.
 _NEAR_PX, _ALONE_PX = 1.0, 12.0
 
 
 def measure_against_truth(exposure):
-    """Measure the stars of a rendered image and hold them against the truth.
+    """Measure the stars of a rendered image and compare them with the truth.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def measure_against_truth(exposure):
     Returns
     -------
     `~astropy.table.Table`
-        One row for each clean source that is a star on its own: ``x``, ``y``, ``dx``, ``dy``
+        One row for each clean source that is an isolated star: ``x``, ``y``, ``dx``, ``dy``
         (measured less true), ``x_err``, ``y_err`` in px, ``snr`` and ``magnitude``.
     """
     sources = measure_sources(exposure.frame(image=True))
@@ -64,11 +64,11 @@ def reproduce_centroids(folder, scale, *, seed=SEED, jobs=1, progress=None):
     Parameters
     ----------
     folder : Path
-        Where figures go; it must exist.
+        Existing folder for the figures.
     scale : Scale
-        How large it is.
+        Size of the reproduction.
     seed : int, optional
-        Of the camera and of the field.
+        Seed of the camera and of the field.
     jobs : int, optional
         Not used: images are measured one by one.
     progress : callable, optional
@@ -77,8 +77,8 @@ def reproduce_centroids(folder, scale, *, seed=SEED, jobs=1, progress=None):
     Returns
     -------
     `~astropy.table.QTable`
-        See `~wpdc_gwcs.reproduction.results.tabulate_results`.  The paper's method has centroids of
-        PSF fits, too: there is no number of its own for ``literal``.
+        See `~wpdc_gwcs.reproduction.results.tabulate_results`.  The literal method uses PSF fits
+        too, so it has no numbers of its own.
 
     Notes
     -----
@@ -124,7 +124,7 @@ def reproduce_centroids(folder, scale, *, seed=SEED, jobs=1, progress=None):
 
 
 def photon_limit(camera, detector, magnitude):
-    """Give the centroid error that photons, sky and read noise leave.
+    """Return the centroid error due to photons, sky and read noise.
 
     Parameters
     ----------
@@ -138,8 +138,8 @@ def photon_limit(camera, detector, magnitude):
     Returns
     -------
     (N,) ndarray
-        Errors along one axis, px: the Cramer-Rao bound of the mean PSF on pixels, for a star in
-        the middle of one.
+        Errors along one axis, px: the Cramer-Rao bound of the mean pixelated PSF, for a star at
+        the center of a pixel.
     """
     _, _, profile, slope = camera.psf_stamp()
     flux = camera.flux(magnitude, detector)[:, None]

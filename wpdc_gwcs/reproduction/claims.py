@@ -1,4 +1,4 @@
-"""The numbers of the paper, with the places where they stand."""
+"""The numbers of the paper and where they appear in it."""
 
 from dataclasses import dataclass
 
@@ -12,11 +12,11 @@ class Claim:
     Parameters
     ----------
     part : str
-        Part of the reproduction that has it.
+        Part of the reproduction.
     item : str
-        What it is of: a detector, a weight, "all".
+        A detector, a weight, or "all".
     quantity, unit : str
-        What it is.
+        Quantity and its unit.
     value : float
         The number.
     source : str

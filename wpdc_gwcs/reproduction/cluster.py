@@ -1,4 +1,4 @@
-"""A globular cluster like NGC 2298: images, its core left out, figures 8 and 9.
+"""A globular cluster like NGC 2298, without its core: figures 8 and 9.
 
 ::
 
@@ -26,10 +26,10 @@ __all__ = ["reproduce_cluster"]
 
 _DETECTOR = "g-1"
 _CENTER = SkyCoord(102.246, -36.005, unit="deg")
-# More than 5,000 stars per square arcmin in the core, the field's own besides.
+# More than 5,000 stars per square arcmin in the core, in addition to the field.
 _DENSITY, _FIELD = 5500.0, 60.0
 _MIN_SNR = 30.0
-# Magnitudes at which the paper gives the scatter, and the width of its bins.
+# Magnitudes at which the paper gives the scatter, and the width of the bins.
 _MAGNITUDES, _WIDTH = (19.0, 23.75), 0.5
 
 
@@ -39,13 +39,13 @@ def reproduce_cluster(folder, scale, *, seed=SEED, jobs=1, progress=None):
     Parameters
     ----------
     folder : Path
-        Where figures go; it must exist.
+        Existing folder for the figures.
     scale : Scale
-        How large it is.
+        Size of the reproduction.
     seed : int, optional
-        Of the camera and of the field.
+        Seed of the camera and of the field.
     jobs : int, optional
-        Processes in which frames are measured and matched.
+        Number of processes that measure and match frames.
     progress : callable, optional
         Called as ``progress("cluster", done, total)``.
 
@@ -53,8 +53,8 @@ def reproduce_cluster(folder, scale, *, seed=SEED, jobs=1, progress=None):
     -------
     `~astropy.table.QTable`
         See `~wpdc_gwcs.reproduction.results.tabulate_results`.  ``sigma_dx`` is after 3-sigma
-        clipping, ``raw_sigma_dx`` before it; ``photon_limit`` and ``raw_photon_limit`` are what the
-        same two would be if centroids had no other error than that of photons, sky and read noise.
+        clipping, ``raw_sigma_dx`` before it; ``photon_limit`` and ``raw_photon_limit`` are the
+        same two for centroids limited by photons, sky and read noise.
 
     Notes
     -----
@@ -125,14 +125,14 @@ def _quantities(simulation, run, cuts):
     )
     camera = simulation.camera
     limit = photon_limit(camera, camera.detectors[0], magnitude)
-    # Clipping a sum of Gaussians has no closed form: drawn, the same in each call.
+    # Clipping a sum of Gaussians has no closed form: simulated with a fixed seed.
     drawn = evaluate(*np.random.default_rng(0).normal(size=(2, limit.size)) * limit)
     found[_DETECTOR, "photon_limit", "pix"] = np.hypot(drawn.sigma_dx, drawn.sigma_dy) / np.sqrt(2)
     found[_DETECTOR, "raw_photon_limit", "pix"] = float(np.sqrt(np.mean(limit**2)))
     for middle in _MAGNITUDES:
         inside = np.abs(magnitude - middle) <= _WIDTH / 2
         s = evaluate(dx[inside], dy[inside])
-        # Of one axis, both taken together.
+        # Per axis, averaged over both.
         found[f"g = {middle:g}", "sigma_total", "pix"] = float(
             np.hypot(s.sigma_dx, s.sigma_dy) / np.sqrt(2)
         )

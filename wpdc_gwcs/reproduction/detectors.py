@@ -1,4 +1,4 @@
-"""The 18 detectors: tables 1 and 2, figures 1 and 6, literal and default method side by side.
+"""The 18 detectors with the literal and the default method: tables 1 and 2, figures 1 and 6.
 
 ::
 
@@ -27,9 +27,9 @@ from wpdc_gwcs.simulation import simulate
 
 __all__ = ["METHODS", "calibrate_fields", "reproduce_detectors", "simulate_fields"]
 
-# The paper's method to the letter, and what the package does by default.
+# The literal method of the paper, and the default method.
 METHODS = {"literal": "paper", "ours": "wpdc"}
-# The detector that the paper shows.
+# The detector that is shown in the paper.
 _SHOWN = "g-1"
 
 
@@ -41,14 +41,14 @@ def simulate_fields(detector, scale, *, seed):
     detector : str
         Name of a detector of the camera ``csst-msc``.
     scale : Scale
-        How large it is.
+        Size of the reproduction.
     seed : int
-        Of the camera and of the fields.
+        Seed of the camera and of the fields.
 
     Returns
     -------
     Simulation
-        One exposure of each field, with a catalog that is the truth.
+        One exposure per field, with an exact catalog.
     """
     return simulate(
         1,
@@ -68,13 +68,13 @@ def calibrate_fields(simulation, scale, *, method="wpdc", jobs=1, **settings):
     simulation : Simulation
         As from `simulate_fields`.
     scale : Scale
-        How large it is.
+        Size of the reproduction.
     method : {"wpdc", "paper"}, optional
-        The default method, or the paper's to the letter.
+        The default method, or the literal one of the paper.
     jobs : int, optional
-        Processes in which frames are matched.
+        Number of processes that match frames.
     **settings
-        Of `~wpdc_gwcs.calibration.Settings`.
+        Options of `~wpdc_gwcs.calibration.Settings`.
 
     Returns
     -------
@@ -95,11 +95,11 @@ def _quantities(pooled, score):
     return {
         **{(name, "pix"): getattr(s, name) for name in moments},
         ("wcs_rms", "pix"): score.wcs_rms,
-        # What all exposures have in common: the rest is the noise of the numbers of each of them.
+        # The error common to all exposures; the rest is the noise of single exposures.
         ("wcs_rms_static", "pix"): score.wcs_rms_static,
         ("wcs_max", "pix"): score.wcs_max,
         ("share_below_0p01", ""): score.share_below,
-        # The paper knows no truth: it counts the cells of its map whose mean residual is short.
+        # The paper has no truth: it counts the cells of its map with a short mean residual.
         ("share_of_cells_below_0p01", ""): pooled.share_below,
         ("n_stars", ""): s.n,
         ("n_wrong", ""): score.n_wrong_used,
@@ -112,13 +112,13 @@ def reproduce_detectors(folder, scale, *, seed=SEED, jobs=1, progress=None):
     Parameters
     ----------
     folder : Path
-        Where tables and figures go; it must exist.
+        Existing folder for tables and figures.
     scale : Scale
-        How large it is.
+        Size of the reproduction.
     seed : int, optional
-        Of the camera and of the fields.
+        Seed of the camera and of the fields.
     jobs : int, optional
-        Processes in which frames are matched.
+        Number of processes that match frames.
     progress : callable, optional
         Called as ``progress("detectors", done, total)``.
 
@@ -145,7 +145,7 @@ def reproduce_detectors(folder, scale, *, seed=SEED, jobs=1, progress=None):
                 numbers[name] |= _draw_shown(run, name, folder)
             if name == "ours":
                 shown.append(run.calibrations[0])
-            # Of the literal method the solution alone is needed from here on.
+            # From here on, only the solution of the literal method is needed.
             del run
         size = simulation.distortion.greatest()
         found[detector, "largest_distortion", "pix"] = (size, size)
@@ -165,7 +165,7 @@ def reproduce_detectors(folder, scale, *, seed=SEED, jobs=1, progress=None):
 
 
 def _draw_shown(run, name, folder):
-    """Draw the detector that the paper shows, and write its look-up table."""
+    """Draw the detector shown in the paper, and write its look-up table."""
     solution = run.calibrations[0].solution
     axes = plot_before_after(
         [uncorrected_residuals(c) for c in run.calibrations],
@@ -191,7 +191,7 @@ def _draw_shown(run, name, folder):
 
 
 def _draw_focal_plane(calibrations, scale, seed, folder):
-    """Draw the distortions where the detectors stand: of one pointing, with their solutions."""
+    """Draw the solved distortions at the positions of the detectors, for one pointing."""
     one = simulate(
         1,
         camera="csst-msc",

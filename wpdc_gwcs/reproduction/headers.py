@@ -1,4 +1,4 @@
-"""Real headers of 90Prime: the distortion of each, on a whole chip beside its reference point.
+"""Real headers of 90Prime: their distortions, transferred to whole chips.
 
 ::
 
@@ -20,27 +20,27 @@ __all__ = ["chip_distortion", "find_headers", "header_camera"]
 _VARIABLE = "WPDC_GWCS_DATA"
 _FOLDER = Path("wcs_headers", "legacysurvey", "90prime")
 _CAMERA = "bass-90prime"
-# A chip, and how far the reference point of the camera is from its nearest corner, px.  The headers
-# are those of cut-outs, whose reference points have moved with them.
+# Size of a chip, and distance of its nearest corner from the camera's reference point, px.  The
+# headers are of cutouts, so their reference points are shifted.
 _SHAPE = (4096, 4032)
 _GAP = (184, 60)
 
 
 def find_headers():
-    """Find the headers.
+    """Return the paths of the headers.
 
     Returns
     -------
     list of Path
-        FITS files in the folder that the environment variable ``WPDC_GWCS_DATA`` names; none where
-        it is not set.
+        FITS files in the folder given by the environment variable ``WPDC_GWCS_DATA``; none if it is
+        not set.
     """
     root = os.environ.get(_VARIABLE)
     return sorted((Path(root) / _FOLDER).glob("*.fits")) if root else []
 
 
 def chip_distortion(path):
-    """Put the distortion of a header onto a whole chip.
+    """Transfer the distortion of a header to a whole chip.
 
     Parameters
     ----------
@@ -50,8 +50,8 @@ def chip_distortion(path):
     Returns
     -------
     distortion : Distortion
-        The PV polynomial of the header in pixels, about a reference point off the chip, on the side
-        where the header has it.
+        The PV polynomial of the header in pixels, about a reference point outside the chip, on the
+        same side as in the header.
     crpix : (2,) ndarray
         The reference point, px, zero based.
     degree : int
@@ -76,7 +76,7 @@ def chip_distortion(path):
 
 
 def header_camera(path):
-    """Make a camera of one chip of 90Prime, with the distortion of a header.
+    """Make a camera of one 90Prime chip, with the distortion of a header.
 
     Parameters
     ----------
@@ -86,13 +86,14 @@ def header_camera(path):
     Returns
     -------
     camera : SimulatedCamera
-        The chip, named after the file; its headers have the reference point of the camera, off it.
+        The chip, named after the file; its headers have the reference point of the camera, outside
+        the chip.
     degree : int
         Degree of the header's polynomial.
 
     Notes
     -----
-    The matrix of the header, its rotation and its skew, is replaced by that of the simulation.
+    The linear matrix of the header (rotation and skew) is replaced by that of the simulation.
     """
     distortion, crpix, degree = chip_distortion(path)
     place = tuple(map(float, np.subtract(distortion.center, crpix)))

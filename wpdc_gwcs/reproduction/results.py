@@ -1,4 +1,4 @@
-"""What was found beside what the paper says: one table for all parts."""
+"""Results compared with the paper, in one table for all parts."""
 
 import math
 
@@ -12,21 +12,21 @@ _WHERE = {(c.part, c.item, c.quantity): c for c in CLAIMS}
 
 
 def tabulate_results(part, found):
-    """Put what was found of a part beside what the paper says.
+    """Tabulate the results of a part beside the numbers of the paper.
 
     Parameters
     ----------
     part : str
         Name of the part.
     found : dict
-        ``(item, quantity, unit)`` to the numbers of the literal and of the default method, NaN
-        where there is none.
+        Numbers of the literal and of the default method (NaN for none), by
+        ``(item, quantity, unit)``.
 
     Returns
     -------
     `~astropy.table.QTable`
-        Columns ``part``, ``item``, ``quantity``, ``unit``, ``paper`` (NaN where it says nothing),
-        ``literal``, ``ours`` and ``source``: where the paper says it.
+        Columns ``part``, ``item``, ``quantity``, ``unit``, ``paper`` (NaN if it has none),
+        ``literal``, ``ours`` and ``source``, the place in the paper.
 
     Examples
     --------

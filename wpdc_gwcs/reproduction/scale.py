@@ -1,4 +1,4 @@
-"""How large a reproduction is: the paper's own size, or one for tests."""
+"""Size of a reproduction: that of the paper, or a small one for tests."""
 
 from dataclasses import dataclass, field
 
@@ -10,14 +10,14 @@ from wpdc_gwcs.reproduction.claims import DETECTORS
 
 __all__ = ["FULL", "QUICK", "SEED", "Scale"]
 
-#: The seed of the reproduction: the number of the paper, arXiv 2603.09193.  The cameras were made
-#: ready with other ones.
+#: Seed of the reproduction: the arXiv number of the paper, 2603.09193.  The cameras were tuned with
+#: other seeds.
 SEED = 9193
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How large a reproduction is.
+    """Size of a reproduction.
 
     Parameters
     ----------
@@ -26,27 +26,27 @@ class Scale:
     n_fields : int
         Fields of each detector.
     densities : (float, float)
-        Stars per square arcmin in the poorest and in the richest field, as g sees them.
+        Stars per square arcmin (g band) in the poorest and in the richest field.
     camera : dict
-        Options of the camera ``csst-msc``, empty for its own size.
+        Options of the camera ``csst-msc``; empty for its full size.
     r0 : float
-        Radius within which all stars weigh the same, px.
+        Radius within which all stars have the same weight, px.
     slice_width : float
         Width of the slices of the detector, px.
     n_bass : int
         Exposures of the four chips of 90Prime.
     r0_bass : float
-        The same radius on its chips, px.
+        The same radius for the 90Prime chips, px.
     bass : dict
-        Options of the camera ``bass-90prime`` and of its field, empty for its own size.
+        Options of the camera ``bass-90prime`` and of its field; empty for its full size.
     n_headers : int or None
-        Real headers of 90Prime at most; `None` for all that there are.
+        Maximum number of real 90Prime headers; `None` for all.
     scamp : bool
-        Whether SCAMP runs beside, where it is installed; it takes seconds for each list.
+        Whether to run SCAMP too, if it is installed; it takes seconds per list.
     n_images, n_cluster : int
-        Images whose centroids are measured, and images of the cluster.
+        Number of images for centroids, and of images of the cluster.
     images : dict
-        Options of the camera ``csst-msc`` and of its field for images, empty for its own size.
+        Options of the camera ``csst-msc`` and of its field for images; empty for its full size.
     """
 
     detectors: tuple[str, ...] = DETECTORS
@@ -65,12 +65,12 @@ class Scale:
     images: dict = field(default_factory=dict)
 
     def fields(self, seed):
-        """Choose where on the sky the fields are, and how rich.
+        """Choose positions and star densities of the fields.
 
         Parameters
         ----------
         seed : int
-            Seed of the choice.
+            Random seed.
 
         Returns
         -------
@@ -87,7 +87,7 @@ class Scale:
 
 
 FULL = Scale()
-# A ninth of the side at four times the angle of a pixel: as many stars in a hundredth of the time.
+# A ninth of the side with four times the pixel scale: enough stars in a hundredth of the time.
 QUICK = Scale(
     detectors=("y-1", "NUV-1", "g-1", "z-2"),
     n_fields=4,

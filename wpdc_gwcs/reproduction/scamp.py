@@ -1,4 +1,4 @@
-"""SCAMP beside, where it is installed: the same lists and the same catalog.
+"""SCAMP for comparison, if it is installed: the same lists and the same catalog.
 
 ::
 
@@ -24,11 +24,11 @@ from wpdc_gwcs.io.tan import parse_tan
 __all__ = ["has_scamp", "solve_with_scamp"]
 
 _PROGRAM = "scamp"
-# What a catalog without errors is taken for, mas: SCAMP weighs stars by them.
+# Errors assumed for a catalog without errors, mas: SCAMP weights stars by them.
 _LEAST_ERROR = 0.1
 _MAS = 1 / 3.6e6  # deg
-# Off: what draws, asks a server or solves for magnitudes.  Headers point to within arc seconds, and
-# distortions reach 18 of them.
+# Plots, servers and photometry are switched off.  Headers are accurate to arcseconds, and
+# distortions reach 18 arcsec.
 _OPTIONS = {
     "ASTREF_CATALOG": "FILE",
     "ASTREFCENT_KEYS": "X_WORLD,Y_WORLD",
@@ -50,12 +50,12 @@ _OPTIONS = {
 
 
 def has_scamp():
-    """Tell whether SCAMP is installed.
+    """Return whether SCAMP is installed.
 
     Returns
     -------
     bool
-        Whether there is a program of its name.
+        True if its program is found.
     """
     return shutil.which(_PROGRAM) is not None
 
@@ -66,21 +66,21 @@ def solve_with_scamp(simulation, *, degree, threads=1):
     Parameters
     ----------
     simulation : Simulation
-        Exposures of one epoch, solved from their source lists.
+        Exposures of one epoch, with source lists.
     degree : int
-        Degree of the polynomial, one for all exposures of a detector.
+        Degree of the polynomial that all exposures of a detector share.
     threads : int, optional
-        Threads that it may use.
+        Maximum number of threads.
 
     Returns
     -------
     dict
-        Name of an exposure to `astropy.wcs.WCS`.
+        The `astropy.wcs.WCS` of each exposure, by name.
 
     Raises
     ------
     WPDCError
-        If it is not installed, or ends without a solution.
+        If SCAMP is not installed or finds no solution.
     """
     if not has_scamp():
         raise WPDCError(f"{_PROGRAM} must be installed, is not")
@@ -111,7 +111,7 @@ def solve_with_scamp(simulation, *, degree, threads=1):
 
 
 def _write_reference(simulation, path):
-    """Write the catalog at the epoch of the exposures: SCAMP knows no motions in a file."""
+    """Write the catalog at the epoch of the exposures: SCAMP reads no motions from files."""
     epoch = simulation.exposures[0].epoch
     catalog = propagate(read_catalog(simulation.reference), epoch)
     columns = {"X_WORLD": catalog["ra"], "Y_WORLD": catalog["dec"]}

@@ -1,4 +1,4 @@
-"""Results of a reproduction held against the truth of its simulation."""
+"""Results of a reproduction compared with the truth of its simulation."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from wpdc_gwcs.evaluation import score_frame
 
 __all__ = ["CLOSE_PX", "score_run", "sky_error"]
 
-#: The paper counts the area where the solution is better than this, px.
+#: Limit of the paper for the area with a good solution, px.
 CLOSE_PX = 0.01
 _MAS = 3.6e6  # per deg
 
@@ -17,11 +17,11 @@ def score_run(simulation, run, *, images=False):
     Parameters
     ----------
     simulation : Simulation
-        What the frames were simulated by.
+        Simulation of the frames.
     run : CalibrationRun
         Their calibration.
     images : bool, optional
-        Whether sources were measured on images, so that they are not those of the lists.
+        Whether sources were measured on images instead of taken from lists.
 
     Returns
     -------
@@ -40,12 +40,12 @@ def score_run(simulation, run, *, images=False):
 
 
 def sky_error(solved):
-    """Give the error of WCSs along east and north, over all frames and their detectors.
+    """Return the WCS error along east and north, over all frames and detectors.
 
     Parameters
     ----------
     solved : sequence of (FrameTruth, callable)
-        The truth about each frame, and its WCS, as of `FrameTruth.wcs_error`.
+        Truth of each frame, and its WCS as for `FrameTruth.wcs_error`.
 
     Returns
     -------

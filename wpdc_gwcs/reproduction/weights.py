@@ -1,4 +1,4 @@
-"""The radial weights: figures 4 and 5, the whole detector and its central field.
+"""The radial weights on the whole detector and in its center: figures 4 and 5.
 
 ::
 
@@ -19,7 +19,7 @@ from wpdc_gwcs.reproduction.scale import SEED
 __all__ = ["reproduce_weights"]
 
 _DETECTOR = "g-1"
-# The paper's weights, and none.
+# The weights of the paper, and uniform weight.
 _WEIGHTS = {
     "w1": "exp-sqrt",
     "w2": "gaussian",
@@ -27,7 +27,7 @@ _WEIGHTS = {
     "w4": "inverse-square",
     "unweighted": "uniform",
 }
-# The paper counts residuals shorter than this, px.
+# Limit of the paper for short residuals, px.
 _SHORT_PX = 0.1
 
 
@@ -37,13 +37,13 @@ def reproduce_weights(folder, scale, *, seed=SEED, jobs=1, progress=None):
     Parameters
     ----------
     folder : Path
-        Where tables and figures go; it must exist.
+        Existing folder for tables and figures.
     scale : Scale
-        How large it is.
+        Size of the reproduction.
     seed : int, optional
-        Of the camera and of the fields.
+        Seed of the camera and of the fields.
     jobs : int, optional
-        Processes in which frames are matched.
+        Number of processes that match frames.
     progress : callable, optional
         Called as ``progress("weights", done, total)``.
 
@@ -56,8 +56,8 @@ def reproduce_weights(folder, scale, *, seed=SEED, jobs=1, progress=None):
     Notes
     -----
     Residuals are those of the polynomial alone.  ``ours`` fits one polynomial to all exposures,
-    ``literal`` one to each.  Writes ``weights.png``, ``weights-central.png``, ``slices.png`` and
-    ``weights.ecsv``, which has them with tables as well.
+    ``literal`` one to each exposure.  Writes ``weights.png``, ``weights-central.png``,
+    ``slices.png`` and ``weights.ecsv``, which also has the residuals with tables.
     """
     simulation = simulate_fields(_DETECTOR, scale, seed=seed)
     run = calibrate_fields(simulation, scale, jobs=jobs)

@@ -1,4 +1,4 @@
-"""Simulated cameras: detectors with names and places in a focal plane, and what they measure."""
+"""Simulated cameras: their detectors in the focal plane, optics and noise."""
 
 from dataclasses import dataclass, field, replace
 
@@ -21,19 +21,19 @@ class SimulatedDetector:
     name : str
         Name of the detector.
     distortion : Distortion
-        Its distortion, in its own pixels.
+        Distortion of the detector, in its own pixels.
     center : (float, float), optional
-        Where headers say that its center is, in px of the focal plane from the point where the
-        camera points; x against right ascension and y toward north where the camera is not turned.
+        Center according to headers, in px of the focal plane from the pointing of the camera;
+        without rotation, x points west and y north.
     offset : (float, float), optional
-        How far its center truly is from there, px.
+        Offset of the true center from there, px.
     axes : (int, int), optional
-        Directions of its pixel axes along those of the focal plane, 1 or -1 each.
+        Directions of the pixel axes along those of the focal plane, 1 or -1 each.
     band : str, optional
-        Filter in front of it.
+        Filter of the detector.
     depth : float, optional
-        By how many magnitudes it sees fainter stars than the camera's ``magnitudes`` say; negative
-        where it sees fewer.
+        Magnitudes by which the detector is deeper than the camera's ``magnitudes``; negative if it
+        is shallower.
     """
 
     name: str
@@ -52,7 +52,7 @@ class SimulatedDetector:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCamera:
-    """A camera whose truth is known: detectors, light, noise.
+    """A simulated camera: detectors, light and noise.
 
     Parameters
     ----------
@@ -61,10 +61,10 @@ class SimulatedCamera:
     detectors : tuple of SimulatedDetector
         Its detectors.
     pixel_scale : `~astropy.units.Quantity`
-        Angle of a pixel.
+        Pixel scale.
     shared_tangent : bool, optional
-        Whether the headers of all detectors have one tangent point, where the camera points, with
-        CRPIX off the detectors; if not, each has its own at its center.
+        Whether the headers of all detectors share a tangent point, the pointing of the camera, with
+        CRPIX outside the detectors; otherwise each has its own at its center.
     magnitudes : (float, float), optional
         Magnitudes of the brightest and of the faintest star.
     limit_snr : float, optional
@@ -87,13 +87,13 @@ class SimulatedCamera:
     Raises
     ------
     ValueError
-        If a value is impossible, or two detectors have one name.
+        If a value is invalid, or two detectors have the same name.
     TypeError
         If the pixel scale has no unit of an angle.
 
     See Also
     --------
-    make_camera : One of the cameras that are ready.
+    make_camera : Make one of the built-in cameras.
     """
 
     name: str
@@ -140,7 +140,7 @@ class SimulatedCamera:
         )
 
     def only(self, names):
-        """Give the camera with some of its detectors.
+        """Return the camera with some of its detectors.
 
         Parameters
         ----------
@@ -150,12 +150,12 @@ class SimulatedCamera:
         Returns
         -------
         SimulatedCamera
-            With these alone, in the camera's order.
+            Camera with these alone, in its own order.
 
         Raises
         ------
         ValueError
-            If it has no detector of a name.
+            If there is no detector with a name.
         """
         known = [d.name for d in self.detectors]
         for name in names:
@@ -163,14 +163,14 @@ class SimulatedCamera:
         return replace(self, detectors=tuple(d for d in self.detectors if d.name in names))
 
     def flux(self, magnitude, detector):
-        """Give the flux of stars.
+        """Return the flux of stars in electrons.
 
         Parameters
         ----------
         magnitude : array_like
-            Their magnitudes.
+            Magnitudes of the stars.
         detector : SimulatedDetector
-            The detector that sees them.
+            Detector that observes them.
 
         Returns
         -------
@@ -180,7 +180,7 @@ class SimulatedCamera:
         return 10 ** (-0.4 * (np.asarray(magnitude) - self.zero_point - detector.depth))
 
     def psf_widths(self, x, y, image_shape):
-        """Give the Gaussian widths of the PSF's core.
+        """Return the Gaussian widths of the PSF's core.
 
         Parameters
         ----------
@@ -201,16 +201,16 @@ class SimulatedCamera:
         return s * (1 + shape), s * (1 - shape)
 
     def psf_stamp(self):
-        """Give the mean PSF on pixels, for a star in the middle of one.
+        """Return the mean pixelated PSF of a star at the center of a pixel.
 
         Returns
         -------
         x, y : (N,) ndarray
-            Pixels, from the star.
+            Pixels relative to the star.
         profile : (N,) ndarray
-            Share of the star's light in each.
+            Fraction of the light of the star in each pixel.
         slope : (N,) ndarray
-            Its derivative by the star's place along x, per px.
+            Derivative of the profile with respect to the x of the star, per px.
         """
         half = int(np.ceil(6 * self.fwhm))
         edges = np.arange(-half, half + 2) - 0.5
@@ -225,7 +225,7 @@ class SimulatedCamera:
         return x.ravel(), y.ravel(), profile.ravel(), slope.ravel()
 
     def snr(self, flux):
-        """Give the signal-to-noise ratio of stars under the PSF's noise-equivalent area.
+        """Return the signal-to-noise ratio of stars under the PSF's noise-equivalent area.
 
         Parameters
         ----------
@@ -241,7 +241,7 @@ class SimulatedCamera:
         return flux / np.sqrt(flux + area * (self.background + self.read_noise**2))
 
     def peak(self, flux):
-        """Give the electrons in the brightest pixel of stars, about.
+        """Return the approximate number of electrons in the brightest pixel of stars.
 
         Parameters
         ----------
@@ -257,32 +257,32 @@ class SimulatedCamera:
 
 
 def require(name, value, good, rule):
-    """Refuse a value that breaks a rule.
+    """Raise an error if a value breaks a rule.
 
     Parameters
     ----------
     name : str
-        What the user calls it.
+        Name of the value for the user.
     value : object
-        What it is.
+        The value.
     good : bool
         Whether it is allowed.
     rule : str
-        What it must be.
+        What it must be, for the message.
     """
     if not good:
         raise ValueError(f"{name} must be {rule}, not {value}")
 
 
 def value_of(name, quantity, unit):
-    """Give an angle or a motion as a number.
+    """Return an angle or a motion as a number.
 
     Parameters
     ----------
     name : str
-        What the user calls it.
+        Name of the value for the user.
     quantity : `~astropy.units.Quantity`
-        What it is.
+        The value.
     unit : `~astropy.units.Unit`
         Unit of the number.
 

@@ -1,4 +1,4 @@
-"""Places that depend on color: refraction by the atmosphere and lateral color of the optics."""
+"""Color-dependent positions: differential refraction and lateral color of the optics."""
 
 from dataclasses import dataclass
 
@@ -11,18 +11,18 @@ __all__ = ["Chromatism"]
 
 @dataclass(frozen=True, eq=False)
 class Chromatism:
-    """How the stars of an exposure are moved by their color, in proportion to it.
+    """Shifts of the stars of an exposure in proportion to their color.
 
     Parameters
     ----------
     color : float
-        Color that is not moved, mag.
+        Color without a shift, mag.
     refraction : (float, float)
         Shift east and north, rad per magnitude.
     center : (float, float)
-        Where the optical axis points, deg.
+        Direction of the optical axis, deg.
     stretch : float
-        Shift away from there over the distance, per magnitude.
+        Shift away from the axis relative to the distance from it, per magnitude.
     """
 
     color: float
@@ -32,22 +32,22 @@ class Chromatism:
 
     @classmethod
     def of(cls, color, *, refraction, lateral, center, rim, rng):
-        """Draw that of an exposure.
+        """Draw the shifts of an exposure.
 
         Parameters
         ----------
         color : float
-            Color that is not moved, mag.
+            Color without a shift, mag.
         refraction : float
-            Length of the shift by the atmosphere, rad per magnitude; where the zenith is is drawn.
+            Shift by the atmosphere, rad per magnitude; the direction of the zenith is random.
         lateral : float
             Shift away from the axis at the rim, rad per magnitude.
         center : (float, float)
-            Where the axis points, deg.
+            Direction of the axis, deg.
         rim : float
             Distance of the farthest corner of the detectors, rad.
         rng : `numpy.random.Generator`
-            Source of the position angle of the zenith.
+            Generator for the position angle of the zenith.
 
         Returns
         -------
@@ -59,12 +59,12 @@ class Chromatism:
         return cls(float(color), along, center, lateral / rim)
 
     def move(self, ra, dec, color):
-        """Give the directions in which stars are seen.
+        """Return the apparent directions of stars.
 
         Parameters
         ----------
         ra, dec : (N,) ndarray
-            Directions of stars of the color that is not moved, deg.
+            Directions of the stars at the color without a shift, deg.
         color : (N,) ndarray
             Their colors, mag.
 

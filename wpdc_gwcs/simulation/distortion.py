@@ -8,11 +8,11 @@ import numpy as np
 
 __all__ = ["Distortion"]
 
-# Points at a time: their powers stay in the cache of a processor.
+# Points per block: their powers stay in the cache.
 _BLOCK = 4096
-# Newton's steps end below this, in half-widths of the detector.
+# Newton's method ends below this step, in half-widths of the detector.
 _LAST_STEP = 1e-9
-# A map is a polynomial if it is one to this, px.
+# Tolerance for a map to be a polynomial, px.
 _SAME_PX = 1e-6
 
 
@@ -25,7 +25,7 @@ class Distortion:
     image_shape : (int, int)
         Shape of the detector ``(ny, nx)``.
     axis : complex
-        Where the optical axis is, in half-widths of the detector from its center.
+        Position of the optical axis, in half-widths of the detector from its center.
     radial : (float, float)
         Cubic and quintic coefficients of the radial distortion about that axis.
     terms : dict
@@ -41,8 +41,8 @@ class Distortion:
         D(z) = (z - a)(k_3 |z - a|^2 + k_5 |z - a|^4) + \sum_{m+n=2}^{6} c_{mn} z^m \bar z^n
                - T_1(z) + \sum_j A_j \sin(\mathrm{Re}\,\bar\kappa_j z + \phi_j)
 
-    where :math:`T_1` takes the constant and the linear part of the radial term at the center away:
-    they belong to the linear WCS.  The inverse is Newton's iteration with the Wirtinger derivatives
+    where :math:`T_1` is the constant and linear part of the radial term at the center, which is in
+    the linear WCS.  The inverse is Newton's iteration with the Wirtinger derivatives
     :math:`D_z, D_{\bar z}`.
     """
 
@@ -67,7 +67,7 @@ class Distortion:
         wavelength : (float, float), optional
             Range of their wavelengths, in units of the longer side.
         rng : `numpy.random.Generator`, optional
-            Source of the numbers.
+            Random number generator.
 
         Returns
         -------
@@ -77,7 +77,7 @@ class Distortion:
         Raises
         ------
         ValueError
-            If the distortion asked for would fold the detector over itself.
+            If the distortion would fold the detector over itself.
         """
         rng = np.random.default_rng(rng)
         axis = rng.uniform(1.5, 3.5) * np.exp(2j * np.pi * rng.uniform())
@@ -93,7 +93,7 @@ class Distortion:
 
     @classmethod
     def off_axis(cls, image_shape, axis, *, quintic=0.0, rng=None):
-        """Draw the distortion of a detector from an optical axis that is known.
+        """Draw the distortion of a detector at a given distance from the optical axis.
 
         Parameters
         ----------
@@ -104,12 +104,12 @@ class Distortion:
         quintic : float, optional
             Quintic coefficient of the radial distortion; the cubic one is 1.
         rng : `numpy.random.Generator`, optional
-            Source of the polynomial terms, smaller by 0.4 from order to order.
+            Random number generator for the polynomial terms, which decrease by 0.4 per order.
 
         Returns
         -------
         Distortion
-            A distortion of arbitrary size: `scaled` gives it the one that is wanted.
+            A distortion of arbitrary size; use `scaled`.
         """
         rng = np.random.default_rng(rng)
         terms = {
@@ -121,7 +121,7 @@ class Distortion:
 
     @classmethod
     def from_map(cls, image_shape, undistort, *, degree):
-        """Give the distortion that a polynomial map of pixels is.
+        """Return the distortion of a polynomial map of pixels.
 
         Parameters
         ----------
@@ -135,15 +135,15 @@ class Distortion:
         Returns
         -------
         Distortion
-            The same map, to 1e-6 px, with its constant and its linear part.
+            The same map to 1e-6 px, including its constant and linear part.
 
         Raises
         ------
         ValueError
-            If the map is no polynomial of this degree.
+            If the map is not a polynomial of this degree.
         """
         empty = cls(tuple(image_shape), 0j, (0.0, 0.0), {})
-        # A polynomial is known by its values at more points than it has coefficients.
+        # Its values at more points than coefficients determine a polynomial.
         node = np.cos(np.pi * np.arange(degree + 3) / (degree + 2))
         z = (node + 1j * node[:, None]).ravel()
         moved = empty._normalise(*undistort(*empty._pixels(z))) - z
@@ -158,12 +158,12 @@ class Distortion:
         return replace(empty, terms=dict(zip(powers, terms.tolist(), strict=True)))
 
     def scaled(self, factor):
-        """Give the same distortion with another size.
+        """Return the distortion scaled by a factor.
 
         Parameters
         ----------
         factor : float
-            What all displacements are multiplied by.
+            Factor on all displacements.
 
         Returns
         -------
@@ -187,7 +187,7 @@ class Distortion:
         wavelength : (float, float), optional
             Range of their wavelengths, in units of the longer side.
         rng : `numpy.random.Generator`, optional
-            Source of the numbers.
+            Random number generator.
 
         Returns
         -------
@@ -209,7 +209,7 @@ class Distortion:
         return replace(self, waves=self.waves + tuple(fine))
 
     def greatest(self):
-        """Give the greatest displacement on the detector.
+        """Return the largest displacement on the detector.
 
         Returns
         -------
@@ -219,12 +219,12 @@ class Distortion:
         return float(np.abs(self._on_grid()[0]).max() * max(self.image_shape) / 2)
 
     def invertible(self):
-        """Tell whether no two pixels fall together.
+        """Return whether the map is one to one on the detector.
 
         Returns
         -------
         bool
-            Whether the Jacobian stays clear of zero on the detector.
+            True if the Jacobian determinant stays well above zero on the detector.
         """
         _, dz, dzbar = self._on_grid()
         return bool((np.abs(1 + dz) - np.abs(dzbar)).min() >= 0.2)
@@ -236,7 +236,7 @@ class Distortion:
 
     @property
     def center(self):
-        """Center of the detector ``(x, y)``, zero based: the point that the distortion leaves."""
+        """Center of the detector ``(x, y)``, zero based, which the distortion leaves in place."""
         ny, nx = self.image_shape
         return (nx - 1) / 2, (ny - 1) / 2
 
@@ -289,7 +289,7 @@ class Distortion:
         return d, dz, dzbar
 
     def undistort(self, x, y):
-        """Detector pixels to undistorted pixels.
+        """Map detector pixels to undistorted pixels.
 
         Parameters
         ----------
@@ -305,7 +305,7 @@ class Distortion:
         return self._pixels(_in_blocks(lambda part: part + self._displace(part)[0], z))
 
     def distort(self, x, y):
-        """Undistorted pixels to detector pixels, the inverse of `undistort`.
+        """Map undistorted pixels to detector pixels, the inverse of `undistort`.
 
         Parameters
         ----------
@@ -315,12 +315,12 @@ class Distortion:
         Returns
         -------
         x, y : ndarray
-            Detector pixel coordinates, zero based; NaN where there is no answer near the detector.
+            Detector pixel coordinates, zero based; NaN if there is no solution near the detector.
         """
         return self._pixels(_in_blocks(self._solve, self._normalise(x, y)))
 
     def _solve(self, target):
-        """Invert z + D(z) by Newton's iteration; NaN where there is no answer near the detector."""
+        """Invert z + D(z) by Newton's method; NaN if there is no solution near the detector."""
         reach = 3 + np.abs(target)
         z = target
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -330,7 +330,7 @@ class Distortion:
                 jacobian = np.abs(1 + dz) ** 2 - np.abs(dzbar) ** 2
                 step = (np.conj(1 + dz) * miss - dzbar * np.conj(miss)) / jacobian
                 z = np.where(np.abs(z) < reach, z + step, np.nan)
-                # Convergence is quadratic: after a step this small nothing is left.
+                # Convergence is quadratic: after such a small step, the error is negligible.
                 if not np.nanmax(np.abs(step), initial=0) > _LAST_STEP:
                     break
             good = np.abs(step) <= _LAST_STEP

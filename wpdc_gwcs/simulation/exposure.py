@@ -24,13 +24,13 @@ from wpdc_gwcs.sky import angles, directions
 __all__ = ["SimulatedExposure"]
 
 _MAS = np.deg2rad(1 / 3.6e6)  # rad
-# Stars just off the detector shine onto it, px.
+# Margin for stars just outside the detector, whose light falls on it, px.
 _MARGIN = 20
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedExposure(FrameTruth):
-    """One exposure of one detector and the truth about it, made by `simulate`.
+    """One exposure of one detector with its truth, made by `simulate`.
 
     Parameters
     ----------
@@ -83,21 +83,21 @@ class SimulatedExposure(FrameTruth):
         detector : SimulatedDetector
             The detector.
         label : str
-            What tells the exposure from others of the camera.
+            Label of the exposure, unique for the camera.
         epoch : float
             Epoch of mid-exposure, Julian years.
         pointing : (Pointing, Pointing)
-            By the header, and in truth.
+            Pointing of the header, and true pointing.
         field : StarField
             The stars.
         measurement : Measurement
-            How source lists are made.
+            Properties of source lists.
         streams : (`numpy.random.PCG64`, `numpy.random.SeedSequence`)
-            Sources of the numbers of the source list and of the image.
+            Random streams of the source list and of the image.
         place : int
             Number of the detector in the camera.
         chromatism : Chromatism, optional
-            How color moves its stars.
+            Shifts of stars by color.
 
         Returns
         -------
@@ -139,7 +139,7 @@ class SimulatedExposure(FrameTruth):
 
     @cached_property
     def stars(self):
-        """Every star on the detector and just off it, without noise.
+        """Every star on the detector or just outside it, without noise.
 
         Columns ``x``, ``y``, ``ra``, ``dec`` (at the epoch of the exposure), ``magnitude``,
         ``reference_index`` (row of the reference, -1 if it is not in it), perhaps ``color``.
@@ -148,7 +148,7 @@ class SimulatedExposure(FrameTruth):
 
     @cached_property
     def sources(self):
-        """What would be measured.
+        """Source list as it would be measured.
 
         Columns ``x``, ``y`` (zero based), ``x_err``, ``y_err`` in px, ``flux`` in counts, ``snr``,
         ``roundness``, and the truth ``reference_index`` (row of the reference, -1 for a spurious
@@ -157,19 +157,19 @@ class SimulatedExposure(FrameTruth):
         return self._measure(self.stars)[0]
 
     def observe(self):
-        """Give the source list, and star by star the truth about it.
+        """Return the source list and the truth of its stars.
 
         Returns
         -------
         sources : `astropy.table.Table`
             As `sources`.
         truth : `astropy.table.Table`
-            The stars on the detector: columns as of `stars` and ``source_index``, the row in the
-            source list, -1 where a star was not detected.
+            The stars on the detector, with the columns of `stars` and ``source_index``, the row in
+            the source list (-1 if a star was not detected).
 
         Notes
         -----
-        Nothing is kept, which saves memory where there are many exposures.
+        Nothing is cached, to save memory with many exposures.
         """
         stars = self._stars()
         sources, source_index = self._measure(stars)
@@ -181,7 +181,7 @@ class SimulatedExposure(FrameTruth):
         ny, nx = self.image_shape
         middle = directions(*self.sky((nx - 1) / 2, (ny - 1) / 2))[0]
         corners = directions(*self.sky([0, nx, 0, nx], [0, 0, ny, ny]))[0]
-        # The farthest corner, a margin for its distortion, and a minute of motion.
+        # The farthest corner, a margin for the distortion, and an arcminute for proper motion.
         radius = np.linalg.norm(corners - middle[:, None], axis=0).max() * 1.1 + 3e-4
         chosen = np.flatnonzero(middle @ self._field.vectors > 1 - radius**2 / 2)
         stars = self._field.stars[chosen]
@@ -207,7 +207,7 @@ class SimulatedExposure(FrameTruth):
         return self._measurement.measure(rng, extra, stars, self._camera, self._detector)
 
     def frame(self, *, image=False):
-        """Give the exposure as input of `~wpdc_gwcs.calibrate`.
+        """Return the exposure as input of `~wpdc_gwcs.calibrate`.
 
         Parameters
         ----------
@@ -217,7 +217,7 @@ class SimulatedExposure(FrameTruth):
         Returns
         -------
         Frame
-            The frame, which knows nothing of the truth.
+            The frame, without the truth.
         """
         data = {"load_image": self.render} if image else {"load_sources": self._measured}
         return Frame(
@@ -266,7 +266,7 @@ class SimulatedExposure(FrameTruth):
         _, seed, place = self._streams
         rng = np.random.Generator(np.random.PCG64(seed).jumped(place))
         galaxies = self._measurement.galaxies if galaxies is None else galaxies
-        # The background is a little brighter toward one side, as it is in practice.
+        # The background increases slightly toward one side, as in practice.
         image = np.empty((ny, nx))
         image[:] = camera.background * (1 + 0.05 * (np.arange(nx) / nx - 0.5))
         x, y = self.stars["x"].data, self.stars["y"].data
@@ -319,7 +319,7 @@ def _make_header(wcs, camera, detector, epoch, name, exposure):
     header["MJD-OBS"] = (start.mjd, "[d] start of the exposure")
     header["GAIN"] = (camera.gain, "[e-/count]")
     header["RDNOISE"] = (camera.read_noise, "[e-]")
-    # A little lower than where pixels end, as cameras give it.
+    # Slightly below the true saturation level, as in headers of cameras.
     header["SATURATE"] = (round(0.95 * camera.saturation / camera.gain, 3), "[count]")
     header["RADESYS"] = "ICRS"
     for i in (0, 1):

@@ -42,7 +42,7 @@ class Simulation:
     camera : SimulatedCamera
         The camera.
     settings : dict
-        The options it was made with.
+        The options of `simulate`.
     """
 
     reference: QTable
@@ -112,38 +112,38 @@ def simulate(
     n_exposures : int, optional
         Number of exposures of each field.
     camera : str or SimulatedCamera, optional
-        One of the cameras that `make_camera` knows, "generic", "csst-msc" or "bass-90prime", or one
-        of your own.
+        Name of a built-in camera ("generic", "csst-msc" or "bass-90prime", see `make_camera`), or a
+        camera.
     detectors : sequence of str, optional
-        Names of the camera's detectors that are simulated; all by default.
+        Names of the detectors to simulate; all by default.
     seed : int, optional
         The same seed gives the same simulation.
     center : `~astropy.coordinates.SkyCoord`, optional
-        Where the middle of the chosen detectors points, one position for each field; one field at
-        RA 120 deg, Dec +30 deg by default.
+        Pointing of the middle of the chosen detectors, one position per field; by default one field
+        at RA 120 deg, Dec +30 deg.
     roll : `~astropy.units.Quantity`, optional
-        Position angle of the camera's y axis, north through east, of all exposures or of each of a
-        field.
+        Position angle of the camera's y axis, north through east: one for all exposures, or one for
+        each exposure of a field.
     density : float or sequence of float, optional
-        Stars per square arcmin down to the faintest magnitude, of all fields or of each.
+        Stars per square arcmin down to the faintest magnitude: one for all fields, or one for each.
     slope : float, optional
         Slope of the luminosity function, d log10 N / d mag.
     reference_limit : float, optional
         Faintest magnitude of the reference catalog; all stars by default.
     catalog_errors : bool, optional
-        Whether the catalog has Gaia's errors; else its positions and motions are the truth, and
-        nothing is said of errors.
+        Whether the catalog has Gaia's errors; otherwise its positions and motions are exact, and it
+        has no error columns.
     cluster : KingCluster, optional
-        A star cluster at the center of each field, besides the field's own stars.
+        A star cluster at the center of each field, in addition to the field stars.
     galaxies : float, optional
         Galaxies per square arcmin, which are in no catalog.
     colors : (float, float), optional
         Mean and scatter of the stars' colors; without them the catalog has none.
     refraction : `~astropy.units.Quantity`, optional
-        Shift of stars toward the zenith per magnitude of color, which is somewhere else for each
-        exposure.
+        Shift of stars toward the zenith per magnitude of color; the direction of the zenith is
+        random for each exposure.
     lateral_color : `~astropy.units.Quantity`, optional
-        Shift of stars away from where the camera points per magnitude of color, at the farthest
+        Shift of stars away from the pointing of the camera per magnitude of color, at the farthest
         corner of its detectors.  The true WCS is that of the mean color.
     proper_motion : `~astropy.units.Quantity`, optional
         Scatter of the proper motions per axis.
@@ -156,15 +156,15 @@ def simulate(
     scale_error : float, optional
         Scatter of the true pixel scale about the header's, relative.
     spurious, lost : float, optional
-        Spurious sources, and stars that are not detected, as shares of the stars on the detector.
+        Spurious sources, and undetected stars, as fractions of the stars on the detector.
     resolution : float, optional
-        Of two sources closer than this, in FWHM, source lists have the brighter one alone.
+        Source lists have only the brighter one of two sources closer than this, in FWHM.
     noise : bool, optional
         Scatter positions in the source lists and in the reference by their errors.
     **camera_options
-        Of a camera that is known by its name: ``image_shape``, ``distortion``, ``waves``,
-        ``pixel_scale``, ``magnitudes``, ``fwhm`` and all else that `make_camera` takes;
-        ``detector``: name of the only detector of the generic one.
+        Options of a built-in camera: ``image_shape``, ``distortion``, ``waves``,
+        ``pixel_scale``, ``magnitudes``, ``fwhm`` and all other options of `make_camera`;
+        ``detector``: name of the only detector of the generic camera.
 
     Returns
     -------
@@ -180,9 +180,9 @@ def simulate(
 
     Notes
     -----
-    What is not given (`None`) is usual for the camera: for "generic" 20 stars per square arcmin,
-    epoch 2016, a dither of 30 arcsec, no motions, 10 % of spurious sources, Gaia's errors, and
-    lists that tell all stars apart.
+    The defaults of options (`None`) depend on the camera: for "generic", 20 stars per square
+    arcmin, epoch 2016, a dither of 30 arcsec, no motions, 10 % of spurious sources, Gaia's errors,
+    and lists without blends.
 
     Examples
     --------
@@ -208,7 +208,7 @@ def simulate(
     settings = {k: v for k, v in locals().items() if k not in ("center", "camera")}
     require("n_exposures", n_exposures, n_exposures >= 1, "at least 1")
     require("seed", seed, isinstance(seed, (int, np.integer)) and seed >= 0, "0 or more")
-    # One stream of numbers for each part: more exposures leave the first ones as they are.
+    # One random stream for each part, so that more exposures do not change the first ones.
     streams = np.random.SeedSequence(int(seed)).spawn(2 + n_exposures)
     usual = {**_USUAL, **USUAL.get(getattr(camera, "name", camera), {})}
     given = {name: settings[name] for name in usual if settings[name] is not None}
@@ -310,7 +310,7 @@ def simulate(
     return Simulation(reference, tuple(exposures), camera, settings)
 
 
-# Usual for any camera, unless its own entry says otherwise.
+# Defaults for any camera without its own entry.
 _USUAL = {
     "density": 20.0,
     "epoch": CATALOG_EPOCH,
@@ -364,7 +364,7 @@ def _each(name, values, n, what):
 
 
 def _chromatic(camera, colors, refraction, lateral_color):
-    """Sizes of the shifts by color in rad per magnitude, `None` where there are none."""
+    """Sizes of the shifts by color in rad per magnitude; `None` for none."""
     sizes = {
         name: float(value_of(name, value, u.rad))
         for name, value in (("refraction", refraction), ("lateral_color", lateral_color))
@@ -388,7 +388,7 @@ def _middle(camera):
 
 
 def _reach(camera, dither, pointing_error):
-    """How far from the nominal center of a detector there have to be stars, deg."""
+    """Distance from the nominal center of a detector up to which stars are needed, deg."""
     size = max(np.hypot(*d.image_shape) for d in camera.detectors)
     distortion = max(d.distortion.greatest() for d in camera.detectors)
     reach = size / 2 * camera.arcsec / 3600 * 1.02 + dither + 4 * pointing_error
@@ -396,7 +396,7 @@ def _reach(camera, dither, pointing_error):
 
 
 def _point(camera, center, roll, dither, scatter, stream):
-    """Draw where an exposure points, by its header and in truth, and what it is measured with."""
+    """Draw the nominal and true pointing of an exposure, and its random streams."""
     seed, image_seed = stream.spawn(2)
     rng = np.random.default_rng(seed)
     along = rng.uniform(-dither, dither, 2) if dither else np.zeros(2)
@@ -411,7 +411,7 @@ def _point(camera, center, roll, dither, scatter, stream):
 
 
 def _near_detectors(stars, camera, pointings, reach):
-    """Mark the stars that some exposure has on a detector or near it."""
+    """Mark the stars on or near a detector in any exposure."""
     if len(camera.detectors) == 1:
         return slice(None)
     centers = []

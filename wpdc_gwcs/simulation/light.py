@@ -1,4 +1,4 @@
-"""Light on the pixels of a simulation: its PSF, and Gaussians drawn into images."""
+"""Light on simulated pixels: the PSF, and Gaussians added to images."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ __all__ = ["DISC", "PSF", "SIGMA_PER_FWHM", "add_gaussians", "find_zero_point"]
 
 SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 # Core and wings of the PSF, as (share of the flux, width in units of the core's): about a Moffat
-# profile with beta = 3.5, yet separable, so that its integral over a pixel is exact.
+# profile with beta = 3.5, but separable, so that its integral over a pixel is exact.
 PSF = ((0.82, 1.0), (0.18, 2.1))
 # An exponential disc of unit half-light radius as a sum of Gaussians.
 DISC = ((0.18, 0.28), (0.47, 0.72), (0.35, 1.45))
@@ -40,18 +40,18 @@ def add_gaussians(image, x, y, flux, sx, sy):
     Parameters
     ----------
     image : (ny, nx) ndarray
-        The image, which is changed.
+        The image, changed in place.
     x, y : (N,) ndarray
-        Their centers, px, zero based.
+        Centers, px, zero based.
     flux : (N,) ndarray
-        Electrons in each.
+        Electrons of each.
     sx, sy : (N,) ndarray
-        Their widths along the axes, px.
+        Widths along the axes, px.
 
     Notes
     -----
-    Stamps are as large as it takes to leave less than 0.02 electrons per pixel outside; stars of
-    one stamp size are drawn together.
+    Stamps are large enough that less than 0.02 electrons per pixel are lost outside; stars with the
+    same stamp size are drawn together.
     """
     from scipy.special import ndtr
 
@@ -70,7 +70,7 @@ def add_gaussians(image, x, y, flux, sx, sy):
             py = np.diff(ndtr((edges - (y[i] - iy)[:, None]) / sy[i, None]), axis=1)
             cx = ix[:, None] + np.arange(-h, h + 1)
             cy = iy[:, None] + np.arange(-h, h + 1)
-            # Pixels off the detector get no light and any address on it.
+            # Pixels outside the detector get zero light at an arbitrary address.
             px *= (cx >= 0) & (cx < nx)
             py *= ((cy >= 0) & (cy < ny)) * flux[i, None]
             address = np.clip(cy, 0, ny - 1)[:, :, None] * nx + np.clip(cx, 0, nx - 1)[:, None, :]

@@ -1,4 +1,4 @@
-"""What would be measured of the stars on a detector: source lists with errors of known size."""
+"""Simulated source lists with known errors."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from wpdc_gwcs.simulation.light import SIGMA_PER_FWHM
 
 __all__ = ["Measurement"]
 
-# Sources below this ratio are in no list.
+# Minimum signal-to-noise ratio of source lists.
 _LEAST_SNR = 5.0
 # Scatter of the roundness of stars, of spurious sources and of galaxies.
 _ROUNDNESS = (0.05, 0.12, 0.5)
@@ -19,20 +19,20 @@ _ROUNDNESS = (0.05, 0.12, 0.5)
 
 @dataclass(frozen=True)
 class Measurement:
-    """How source lists are made.
+    """Properties of source lists.
 
     Parameters
     ----------
     spurious, lost : float
-        Spurious sources, and stars that are not detected, as shares of the stars on the detector.
+        Spurious sources, and undetected stars, as fractions of the stars on the detector.
     noise : bool
-        Whether positions are off by their errors.
+        Whether positions scatter by their errors.
     galaxies : float
         Galaxies per square arcmin.
     slope : float
         Slope of the luminosity function, d log10 N / d mag.
     resolution : float
-        Of two sources closer than this, in FWHM, the list has the brighter one alone.
+        The list has only the brighter one of two sources closer than this, in FWHM.
     """
 
     spurious: float
@@ -48,7 +48,7 @@ class Measurement:
         Parameters
         ----------
         rng, extra : `numpy.random.Generator`
-            Sources of the numbers; the second one of galaxies.
+            Random number generators; the second one is for galaxies.
         stars : `~astropy.table.Table`
             Columns ``x``, ``y``, ``magnitude``, ``reference_index``.
         camera : SimulatedCamera
@@ -62,7 +62,7 @@ class Measurement:
             Columns ``x``, ``y``, ``x_err``, ``y_err``, ``flux``, ``snr``, ``roundness``,
             ``reference_index``.
         source_index : (N,) ndarray of int
-            Row of each star in it, -1 where it was not detected.
+            Row of each star in the sources, -1 if it was not detected.
         """
         ny, nx = detector.image_shape
         x, y, magnitude = stars["x"].data, stars["y"].data, stars["magnitude"].data
@@ -78,7 +78,7 @@ class Measurement:
         spurious = faint - rng.exponential(1 / (self.slope * 3), m)
         flux = camera.flux(np.append(magnitude[rows], spurious), detector)
         snr = camera.snr(flux)
-        # The photon limit of a Gaussian image, and what no image gets under.
+        # The photon limit of a Gaussian image, plus the floor of bright stars.
         sigma = np.hypot(camera.centroid_floor, camera.fwhm * SIGMA_PER_FWHM / snr)
         error = rng.normal(size=(2, n + m)) * sigma * self.noise
         error[:, n:] = 0.0
@@ -110,7 +110,7 @@ class Measurement:
         ny, nx = detector.image_shape
         flux = camera.flux(faint - rng.exponential(1 / (self.slope * 3), n), detector)
         snr = camera.snr(flux)
-        # Twice as wide as stars, and so are their errors.
+        # Twice as wide as stars, with twice their errors.
         sigma = np.hypot(camera.centroid_floor, 2 * camera.fwhm * SIGMA_PER_FWHM / snr)
         return {
             "x": rng.uniform(-0.5, nx - 0.5, n),
@@ -125,7 +125,7 @@ class Measurement:
 
 
 def _outshone(x, y, flux, distance):
-    """Mark sources that are too close to a brighter one to be told from it."""
+    """Mark sources that are blended with a brighter one."""
     hidden = np.zeros(len(x), bool)
     if distance > 0 and len(x):
         pairs = cKDTree(np.column_stack([x, y])).query_pairs(distance, output_type="ndarray")

@@ -1,4 +1,4 @@
-"""Where cameras point, and where that puts each of their detectors on the sky."""
+"""Pointing of cameras, and the resulting WCS of each detector."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ __all__ = ["Pointing", "aim", "tan_wcs"]
 
 @dataclass(frozen=True)
 class Pointing:
-    """Where a camera points.
+    """Pointing of a camera.
 
     Parameters
     ----------
     ra, dec : float
         Direction of its reference point, deg.
     roll : float
-        Position angle of its y axis there, north through east, deg.
+        Position angle of the y axis there, north through east, deg.
     scale : float
         Angle of a pixel, arcsec.
     """
@@ -32,21 +32,21 @@ class Pointing:
 
     @property
     def matrix(self):
-        """Pixels of the focal plane to the tangent plane, deg."""
+        """Matrix from pixels of the focal plane to the tangent plane, deg."""
         c, s = np.cos(np.deg2rad(self.roll)), np.sin(np.deg2rad(self.roll))
         return self.scale / 3600 * np.array([[-c, s], [s, c]])
 
     def linear_wcs(self, detector, place, *, shared_tangent):
-        """Give the WCS of a detector's undistorted pixels.
+        """Return the WCS of the undistorted pixels of a detector.
 
         Parameters
         ----------
         detector : SimulatedDetector
             The detector.
         place : (float, float)
-            Where its center is in the focal plane, px.
+            Position of its center in the focal plane, px.
         shared_tangent : bool
-            Whether the tangent point is the camera's, or its own at its center.
+            Whether the tangent point is that of the camera, or the center of the detector.
 
         Returns
         -------
@@ -55,8 +55,8 @@ class Pointing:
 
         Notes
         -----
-        A detector with a tangent point of its own is turned rigidly with the camera, so that all
-        exposures have one map from pixels to the camera's own sphere.
+        A detector with its own tangent point is rotated rigidly with the camera, so that all
+        exposures have the same map from pixels to the sphere of the camera.
         """
         cd, crpix, crval = self.matrix, np.add(detector.distortion.center, 1), (self.ra, self.dec)
         if shared_tangent:
@@ -67,9 +67,9 @@ class Pointing:
         return tan_wcs(crpix, crval, cd * detector.axes, detector.image_shape)
 
     def _carry(self, east, north):
-        """Direction at an offset in the tangent plane, and how the plane's axes turn there.
+        """Direction at an offset in the tangent plane, and the rotation of its axes there.
 
-        East and north are carried along the great circle to it; `None` where there is no way to go.
+        East and north are carried along the great circle; `None` for a zero offset.
         """
         if east == north == 0:
             return (self.ra, self.dec), None
@@ -84,7 +84,7 @@ class Pointing:
 
 
 def aim(ra, dec, roll, scale, middle):
-    """Point a camera so that a place in its focal plane falls on a direction.
+    """Point a camera so that a position in its focal plane maps to a direction.
 
     Parameters
     ----------
@@ -93,15 +93,15 @@ def aim(ra, dec, roll, scale, middle):
     roll : float
         Position angle of the y axis, deg.
     scale : float
-        Angle of a pixel, arcsec.
+        Pixel scale, arcsec.
     middle : (float, float)
-        The place, px of the focal plane.
+        The position, px of the focal plane.
 
     Returns
     -------
     Pointing
-        The pointing; next to a pole, where position angles change within the camera, the place
-        falls near the direction only.
+        The pointing; very near a pole, where position angles change within the camera, it is
+        approximate.
     """
     pointing = Pointing(float(ra), float(dec), float(roll), scale)
     east, north = pointing.matrix @ middle

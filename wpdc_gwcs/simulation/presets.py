@@ -1,4 +1,4 @@
-"""Cameras that are ready: one detector of any kind, the CSST's Main Survey Camera, 90Prime."""
+"""Built-in cameras: a generic detector, the CSST Main Survey Camera, 90Prime."""
 
 from dataclasses import replace
 
@@ -10,15 +10,15 @@ from wpdc_gwcs.simulation.distortion import Distortion
 
 __all__ = ["CAMERAS", "USUAL", "make_camera"]
 
-# Size of the quintic against the cubic radial distortion at the rim of a focal plane.
+# Ratio of the quintic to the cubic radial distortion at the edge of the focal plane.
 _QUINTIC = 0.15
 
-# Distance from the axis, in half-widths, where a detector's own terms have the size that they have
-# for a single detector.
+# Distance from the axis, in half-widths, where the terms of a detector are as large as those of a
+# single detector.
 _TERMS_AT = 4.0
 
 # Rows of five, from the bottom up, and the four columns of the Main Survey Camera that have
-# imaging detectors, from left to right.  The rest of its 30 detectors are for spectra.
+# imaging detectors, from left to right.  Its other 12 detectors are for spectra.
 _CSST = (
     ("y-1", "i-1", "g-1", "r-1", None),
     ("z-1", "NUV-1", "NUV-2", "u-1", "y-2"),
@@ -31,12 +31,12 @@ _CSST_PITCH = (9750 / 9216, 10130 / 9232)
 # the stars that g sees, y a third.
 _CSST_DEPTH = {"NUV": -3.8, "u": -2.0, "g": 0.0, "r": 0.0, "i": -0.3, "z": -0.8, "y": -2.0}
 
-# Chips of 90Prime: place in the focal plane and directions of their axes, each read out from its
-# outer corner.  The distance of their centers from the reference point in widths and heights.
+# Chips of 90Prime: position in the focal plane and directions of their axes, each read out from its
+# outer corner; distance of their centers from the reference point in widths and heights.
 _BASS = {"CCD1": (-1, -1), "CCD2": (-1, 1), "CCD3": (1, -1), "CCD4": (1, 1)}
 _BASS_PITCH = (0.55, 0.59)
 
-# What a camera is, where the user does not say otherwise, and how it is commonly used.
+# Defaults of the cameras, and of simulations with them.
 _CAMERA = {
     "generic": {"image_shape": (2048, 2048), "distortion": 40.0, "pixel_scale": 0.3 * u.arcsec},
     "csst-msc": {
@@ -81,22 +81,22 @@ CAMERAS = tuple(_CAMERA)
 
 
 def make_camera(preset="generic", *, seed=1, name=None, **options):
-    """Make one of the cameras that are ready, or a variant of it.
+    """Make one of the built-in cameras, or a variant of it.
 
     Parameters
     ----------
     preset : {"generic", "csst-msc", "bass-90prime"}, optional
-        One detector; the 18 imaging detectors of the CSST's Main Survey Camera, the tangent point
-        of each at its center; four chips about a tangent point between them.
+        A single detector; the 18 imaging detectors of the CSST Main Survey Camera, each with the
+        tangent point at its center; or four chips around a common tangent point.
     seed : int or `numpy.random.SeedSequence`, optional
-        Another seed, another distortion.
+        Seed of the distortion.
     name : str, optional
         Name of the only detector of the generic camera, "sim" by default.
     **options
-        ``image_shape`` : (int, int), shape of each detector ``(ny, nx)``, to which the layout
-        keeps its proportions; ``distortion`` : float, greatest displacement by the smooth
-        distortion, over all detectors, in px; ``waves`` : float, scatter of the amplitudes of fine
-        waves, in px; and the parameters of `SimulatedCamera` but for its detectors.
+        ``image_shape`` : (int, int), shape of each detector ``(ny, nx)``, with which the layout
+        scales; ``distortion`` : float, largest displacement by the smooth distortion, over all
+        detectors, in px; ``waves`` : float, scatter of the amplitudes of fine waves, in px; and the
+        parameters of `SimulatedCamera` except its detectors.
 
     Returns
     -------
@@ -106,15 +106,15 @@ def make_camera(preset="generic", *, seed=1, name=None, **options):
     Raises
     ------
     ValueError
-        If there is no such preset, or a value is impossible.
+        If there is no such preset, or a value is invalid.
     TypeError
         If an option is unknown.
 
     Notes
     -----
-    A detector of a mosaic has the radial distortion of the common optics about their axis, cubic
-    and quintic, less what is constant and linear over the detector, which its header has; terms of
-    its own up to degree 6; and six waves of 0.2 to 0.65 of its longer side.
+    A detector of a mosaic has the cubic and quintic radial distortion of the common optics, without
+    the part that is constant or linear over the detector, which is in its header; its own terms up
+    to degree 6; and six waves of 0.2 to 0.65 of its longer side.
 
     Examples
     --------
@@ -148,7 +148,7 @@ def make_camera(preset="generic", *, seed=1, name=None, **options):
 
 
 def _csst_places(shape):
-    """Name to center, axes, band and depth."""
+    """Center, axes, band and depth by name."""
     pitch = np.multiply(_CSST_PITCH, shape[::-1])
     found = {}
     for column, names in enumerate(_CSST):
@@ -173,7 +173,7 @@ def _bass_places(shape):
 def _with_optics(places, shape, distortion, waves, seed):
     half = max(shape) / 2
     streams = [np.random.default_rng(s) for s in seed.spawn(1 + len(places))]
-    # The axis is not quite where the camera points.
+    # The axis is slightly off the pointing of the camera.
     axis = streams[0].normal(0, 0.2, 2) * half
     rim = max(np.hypot(*np.subtract(p["center"], axis)) for p in places.values()) / half + np.sqrt(
         2
@@ -183,7 +183,7 @@ def _with_optics(places, shape, distortion, waves, seed):
     for place, rng in zip(places.values(), streams[1:], strict=True):
         x, y = np.subtract(axis, place["center"]) * place.get("axes", (1, 1)) / half
         one = Distortion.off_axis(shape, complex(x, y), quintic=quintic, rng=rng)
-        # What is a detector's own grows toward the rim with what is common.
+        # The terms of a detector grow toward the edge, like the common ones.
         own = (max(np.hypot(x, y), 1.0) / _TERMS_AT) ** 1.5
         drawn.append(replace(one, terms={key: own * c for key, c in one.terms.items()}))
     gain = distortion / max(one.greatest() for one in drawn)
@@ -195,7 +195,7 @@ def _with_optics(places, shape, distortion, waves, seed):
                 f"a distortion of {distortion:g} px (waves {waves:g} px) is not invertible on a "
                 f"detector of {shape[1]} x {shape[0]} px"
             )
-        # Detectors are glued to within a few pixels of their places.
+        # Detectors are mounted to within a few pixels.
         offset = tuple(map(float, rng.normal(0, 3e-4, 2) * shape[::-1]))
         detectors.append(SimulatedDetector(name, own, offset=offset, **place))
     return tuple(detectors)

@@ -1,4 +1,4 @@
-"""Stars of a simulation: where they truly are, and what a reference catalog says of them."""
+"""Stars of a simulation: true positions, and the reference catalog of them."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from wpdc_gwcs.sky import angles, directions
 __all__ = ["KingCluster", "make_reference", "make_stars", "offset_positions"]
 
 _MAS = np.deg2rad(1 / 3.6e6)  # rad
-# More stars than this do not fit into the memory of most machines.
+# Maximum number of stars, for the memory of most machines.
 _MOST_STARS = 100_000_000
 CATALOG_EPOCH = 2016.0
 
@@ -24,14 +24,14 @@ class KingCluster:
     Parameters
     ----------
     density : float
-        Members per square arcmin at its center.
+        Members per square arcmin at the center.
     core_radius, tidal_radius : `~astropy.units.Quantity`
         Radius at which the density is about half, and radius at which it ends.
 
     Raises
     ------
     ValueError
-        If a value is impossible.
+        If a value is invalid.
     TypeError
         If a radius has no unit of an angle.
 
@@ -60,7 +60,7 @@ class KingCluster:
         return tuple(float(value_of(name, getattr(self, name), u.arcmin)) for name in names)
 
     def _profile(self):
-        """Give radii in arcmin, and the members within each."""
+        """Return radii in arcmin, and the number of members within each."""
         core, tidal = self._radii()
         r = np.concatenate([[0], np.geomspace(core / 100, tidal, 2000)])
         edge = 1 / np.hypot(1, tidal / core)
@@ -70,17 +70,17 @@ class KingCluster:
         return r, inside
 
     def draw(self, rng):
-        """Draw the places of its members.
+        """Draw the positions of the members.
 
         Parameters
         ----------
         rng : `numpy.random.Generator`
-            Source of the numbers.
+            Random number generator.
 
         Returns
         -------
         east, north : (N,) ndarray
-            Offsets from its center, deg.
+            Offsets from the center, deg.
         """
         radius, inside = self._profile()
         n = rng.poisson(inside[-1])
@@ -90,7 +90,7 @@ class KingCluster:
 
 
 def offset_positions(ra, dec, east, north):
-    """Give positions at offsets in a tangent plane.
+    """Return positions at offsets in a tangent plane.
 
     Parameters
     ----------
@@ -119,11 +119,11 @@ def make_stars(
     Parameters
     ----------
     rng, extra : `numpy.random.Generator`
-        Sources of the numbers; the second one of clusters and colors.
+        Random number generators; the second one is for clusters and colors.
     center : (float, float)
         Right ascension and declination, deg.
     reach : float
-        Half the side of the square that is filled, deg.
+        Half the side of the field, deg.
     density : float
         Stars per square arcmin.
     magnitudes : (float, float)
@@ -131,7 +131,7 @@ def make_stars(
     slope : float
         Slope of the luminosity function.
     cluster : KingCluster or None
-        A cluster at the center, besides.
+        Additional cluster at the center.
     proper_motion : float
         Scatter of the motions per axis, mas / yr.
     colors : (float, float) or None
@@ -172,18 +172,18 @@ def make_stars(
 
 
 def make_reference(rng, stars, *, noise, errors):
-    """Say what a catalog has of stars, at its epoch of 2016.
+    """Make the reference catalog of stars, at epoch 2016.
 
     Parameters
     ----------
     rng : `numpy.random.Generator`
-        Source of the errors.
+        Generator for the errors.
     stars : `~astropy.table.Table`
         The stars, as from `make_stars`.
     noise : bool
-        Whether positions are off by their errors.
+        Whether positions scatter by their errors.
     errors : bool
-        Whether the catalog has errors, those of Gaia; if not, it is the truth.
+        Whether the catalog has errors like those of Gaia; otherwise it is exact.
 
     Returns
     -------
@@ -194,7 +194,7 @@ def make_reference(rng, stars, *, noise, errors):
     ra, dec, magnitude = (stars[name].data for name in ("ra", "dec", "magnitude"))
     columns = {"ra": ra * u.deg, "dec": dec * u.deg}
     if errors:
-        # Gaia's errors: flat for bright stars, then growing as the flux falls.
+        # Errors like Gaia's: constant for bright stars, then growing with decreasing flux.
         error = 0.02 * 10 ** (0.2 * np.clip(magnitude - 14.5, 0, None))
         shift = rng.normal(size=(4, n))[:2] * noise * error * _MAS
         p, e, n_ = directions(ra, dec)

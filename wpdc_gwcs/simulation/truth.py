@@ -12,7 +12,7 @@ __all__ = ["FrameTruth"]
 
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
-    """What is true of a frame, whatever is said of it.
+    """The true mapping of a frame.
 
     Parameters
     ----------
@@ -23,13 +23,14 @@ class FrameTruth:
     epoch : float
         Epoch of mid-exposure, Julian years.
     exposure : str or None
-        What the exposures of all detectors of a mosaic have in common; `None` of a single detector.
+        Name that the frames of all detectors of a mosaic exposure share; `None` for a single
+        detector.
     distortion : Distortion
         The distortion of the detector.
     linear_wcs : `astropy.wcs.WCS`
         The true WCS of undistorted pixels.
     color : float, optional
-        Color of the stars that the map is of, where places depend on color; others are moved.
+        Color that the map is for, if positions depend on color.
     """
 
     name: str
@@ -46,7 +47,7 @@ class FrameTruth:
         return self.distortion.image_shape
 
     def sky(self, x, y):
-        """Give the true sky position of detector pixels.
+        """Return the true sky position of detector pixels.
 
         Parameters
         ----------
@@ -61,22 +62,22 @@ class FrameTruth:
         return self.linear_wcs.wcs_pix2world(*self.distortion.undistort(x, y), 0)
 
     def pixel(self, ra, dec):
-        """Give the true detector pixel of sky positions.
+        """Return the true detector pixel of sky positions.
 
         Parameters
         ----------
         ra, dec : array_like
-            ICRS, degrees, of the frame's own part of the sky.
+            ICRS, degrees, near the frame.
 
         Returns
         -------
         x, y : ndarray
-            Detector pixel coordinates, zero based, also beyond the edges of the detector.
+            Detector pixel coordinates, zero based; also outside the detector.
         """
         return self.distortion.distort(*self.linear_wcs.wcs_world2pix(ra, dec, 0))
 
     def error_at(self, wcs, x, y):
-        """Error of a WCS against the truth at positions on the detector.
+        """Return the error of a WCS against the truth at detector positions.
 
         Parameters
         ----------
@@ -96,7 +97,7 @@ class FrameTruth:
         return found_x - true_x, found_y - true_y
 
     def wcs_error(self, wcs, *, n_grid=101):
-        """Error of a WCS against the truth on a regular grid over the detector.
+        """Return the error of a WCS against the truth on a grid over the detector.
 
         Parameters
         ----------

@@ -267,7 +267,7 @@ def _spectra(products, basis, prior, errors, scales, stale):
 
 
 def _marginal(normal, right, power):
-    """Give what a field leaves of normal equations, and the log evidence of the field."""
+    """Return what a field leaves of normal equations, and the log evidence of the field."""
     root = np.sqrt(power)
     inner = normal * root[:, None] * root
     inner[np.diag_indices_from(inner)] += 1.0

@@ -136,7 +136,7 @@ class SolveResult:
     table_infos : dict
         Name of a detector to its `TableInfo`; no entry where there was no table to be made.
     reference_color : float or None
-        Color that the solution is for; `None` where no colors were given.
+        Color that the solution is for; `None` if no colors were given.
     """
 
     solutions: dict

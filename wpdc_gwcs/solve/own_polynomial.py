@@ -17,7 +17,7 @@ _STARS_PER_TERM = 3
 
 
 def own_polynomial(o, state, f, solution, parts, residual, weights):
-    """Give a frame a polynomial of its own, the table fixed.
+    """Return a frame a polynomial of its own, the table fixed.
 
     Parameters
     ----------

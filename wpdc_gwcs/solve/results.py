@@ -32,7 +32,7 @@ def frozen_result(o, state, stored, infos, group, settings, cd, update):
     stored : dict
         Name of a detector to the `~wpdc_gwcs.solution.DistortionSolution` that it had.
     infos : list
-        What is known of each detector's table, `None` where it has none.
+        What is known of each detector's table, `None` if it has none.
     group : ndarray of int
         Fold of each star, see `~wpdc_gwcs.solve.tables.folds`.
     settings : dict

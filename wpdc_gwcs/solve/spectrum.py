@@ -250,7 +250,7 @@ def learn_spectra(frames, make, *, start, scales, force=False):
 
 
 def _is_common(patches, spectrum):
-    """Tell whether all exposures of a detector have the same field: then it is the detector's."""
+    """Return whether all exposures of a detector have the same field: then it is the detector's."""
     each = common = 0.0
     for basis in {id(p.basis): p.basis for p in patches}.values():
         mine = [p for p in patches if p.basis is basis]
@@ -280,7 +280,7 @@ def pooled_spectrum(patches, *, start, scales):
     Returns
     -------
     Spectrum or None
-        `None` where the stars do not speak for a field.
+        `None` if the stars do not speak for a field.
     """
     straight = [_maximize(patches, kind, start, scales) for kind in KINDS]
     spectrum, gain = max(straight, key=_gain)

@@ -126,7 +126,7 @@ def updated_solution(o, state, k, change, solution, new, n_grid):
     k : int
         Number of the detector.
     change : Change or None
-        What the new exposures say; `None` where the detector has none.
+        What the new exposures say; `None` if the detector has none.
     solution : DistortionSolution
         The stored solution.
     new : ResidualMap

@@ -62,7 +62,7 @@ class DetectorWCS(WCS):
         return fused
 
     def _limits(self, distortion):
-        """Return least and greatest x, least and greatest y, `None` without a bounding box."""
+        """Return smallest and largest x, smallest and largest y, `None` without a bounding box."""
         try:
             box = distortion.bounding_box
         except NotImplementedError:
@@ -79,7 +79,7 @@ class DetectorWCS(WCS):
         *args : array_like
             Pixel coordinates, zero based.
         with_bounding_box : bool, optional
-            Whether points outside the bounding box become ``fill_value``.
+            Whether points outside the bounding box are set to ``fill_value``.
         fill_value : float, optional
             What they become.
         **kwargs
@@ -108,7 +108,7 @@ class DetectorWCS(WCS):
         *args : array_like
             Coordinates in the last frame.
         with_bounding_box : bool, optional
-            Whether points outside the bounding box become ``fill_value``.
+            Whether points outside the bounding box are set to ``fill_value``.
         fill_value : float, optional
             What both coordinates become, there and where there is no answer.
         **kwargs
@@ -160,7 +160,7 @@ class DetectorWCS(WCS):
         pixel_arrays : sequence of array_like
             Pixel coordinates.
         fill_value : float, optional
-            What points outside become.
+            Value of points outside.
 
         Returns
         -------

@@ -201,7 +201,7 @@ _INVERSE_ERROR_PX = 5e-5
 def _stock_inverse(distortion, image_shape):
     """Return a stock model of the inverse: a polynomial, then a table of what it leaves.
 
-    `None` where there is none: no range to make it for, or an image that is folded over.
+    `None` if there is none: no range to make it for, or an image that is folded over.
     """
     plane_map = distortion._plane_map()
     grid = plane_map.grid
