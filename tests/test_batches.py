@@ -289,7 +289,7 @@ class TestPaths:
         for name, text, message in (
             ("none", None, "@none: the list of files must be readable: No such file"),
             ("empty.txt", b"# nothing\n", "the list names no files"),
-            ("x.fits", b"\0\1", "must be a text file with a path in each line"),
+            ("x.fits", b"\0\1", "must be a text file with one path per line"),
         ):
             if text is not None:
                 (folder / name).write_bytes(text)

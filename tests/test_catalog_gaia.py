@@ -268,7 +268,7 @@ def test_environment_names_service_and_folder(tmp_path, monkeypatch):
 
 
 def test_packages_that_are_missing(tmp_path, monkeypatch):
-    from wpdc_gwcs.catalogs import extras
+    from wpdc_gwcs import extras
 
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
     with pytest.raises(CatalogError, match=r"pyvo and astropy_healpix.*wpdc_gwcs\[gaia\]"):

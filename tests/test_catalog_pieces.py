@@ -134,7 +134,7 @@ def test_parquet_has_units_masks_and_metadata(tmp_path):
 
 
 def test_parquet_without_its_reader(tmp_path, monkeypatch):
-    from wpdc_gwcs.catalogs import extras
+    from wpdc_gwcs import extras
 
     (tmp_path / "r.parquet").write_bytes(b"PAR1")
     monkeypatch.setattr(extras, "find_spec", lambda name: None)

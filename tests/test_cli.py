@@ -416,7 +416,7 @@ def test_report_is_written_once(results, tmp_path, capsys):
 
 
 def test_missing_plotting_packages_are_named(results, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("wpdc_gwcs.cli.options.find_spec", lambda name: None)
+    monkeypatch.setattr("wpdc_gwcs.extras.find_spec", lambda name: None)
     assert run(["report", str(results), "--output", str(tmp_path / "page.html")]) == 2
     assert "needs matplotlib and jinja2, not installed here" in error_of(capsys)
 

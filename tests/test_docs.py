@@ -53,6 +53,17 @@ def is_option(parameter):
     return parameter.opts[0].startswith("-")
 
 
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_help_ends_with_an_example_that_parses(name):
+    command, epilog = COMMANDS[name], COMMANDS[name].epilog
+    start = f"Example: wpdc {name} "
+    assert epilog.startswith(start)
+    context = command.make_context(name, shlex.split(epilog.removeprefix(start)))
+    assert context.params
+    first = command.help.split("\n\n")[0].rstrip(".")
+    assert len(first) <= 62, "longer ones are cut off in the list of commands"
+
+
 def test_every_command_is_documented():
     assert sorted(cli_sections()) == sorted(COMMANDS)
 

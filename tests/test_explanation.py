@@ -213,3 +213,18 @@ def test_advice_is_that_of_the_case(sky, what):
         scale = float(re.search(r"--pixel-scale (\S+)", told.advice[-1])[1])
         true = linear_wcs(sky.exposures[0].frame().wcs, np.zeros(2)).scale * 3600
         assert abs(scale / true - 1) < 0.01
+
+
+def test_positions_that_are_worse_than_their_errors(sky, rng):
+    """Noise of 0.5 px where the list states hundredths: the match holds, and the cause is named."""
+    frame = sky.exposures[0].frame()
+    sources = frame.load_sources()
+    for axis in ("x", "y"):
+        sources[axis] += rng.normal(0, 0.5, len(sources))
+    told = explain_frame(replace(frame, load_sources=lambda: sources), sky.reference)
+    assert told.match is not None
+    residuals = told.calibration.statistics["residuals"]
+    (advice,) = [a for a in told.advice if "expected errors" in a]
+    ratio = int(re.search(r"the residuals are (\d+) times", advice)[1])
+    stated = np.median(np.asarray(sources["x_err"], float))
+    assert 0.5 < ratio / (min(residuals["sigma_dx"], residuals["sigma_dy"]) / stated) < 1.5

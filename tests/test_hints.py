@@ -112,3 +112,14 @@ def test_the_header_of_the_command_goes_with_the_hint():
     hint = hint_of_frame(MatchError("no match"), "a.ecsv", catalog="c", wcs="h.head")
     assert hint == "wpdc explain a.ecsv --catalog c --wcs h.head --output why.png"
     assert hint_of("--jobs must be at least 1, got 0") is None
+
+
+def test_no_picture_is_suggested_where_none_can_be_drawn(monkeypatch):
+    monkeypatch.setattr("wpdc_gwcs.extras.find_spec", lambda name: None)
+    hint = hint_of_frame(MatchError("no match"), "a.fits", catalog="c")
+    assert hint == "wpdc explain a.fits --catalog c"
+
+
+def test_of_a_cluster_without_workers():
+    error = "--scheduler tcp://a:8786: must have a worker within 60 s, has none"
+    assert hint_of(error) == "dask worker tcp://a:8786, on machines that see the files"

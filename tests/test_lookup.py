@@ -272,7 +272,7 @@ class TestBuildLookupTable:
     def test_errors(self, rng):
         few = make_map(rng, 30)
         assert build_lookup_table(few)[0] is None
-        with pytest.raises(FitError, match="30 stars in .* bins cannot determine a look-up table; 60"):
+        with pytest.raises(FitError, match="30 stars in .* cannot determine a look-up table; 60"):
             build_lookup_table(few, lut="always")
         with pytest.raises(FitError, match="no residual map"):
             build_lookup_table([])

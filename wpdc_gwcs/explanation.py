@@ -24,8 +24,10 @@ from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs, sky_of
 from wpdc_gwcs.calibration.story import tell_match, tell_sources
 from wpdc_gwcs.catalogs import Region, catalog_source, fill_motions, read_catalog
+from wpdc_gwcs.columns import numbers_or_nan
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import MatchError, WPDCError
+from wpdc_gwcs.extras import PLOT, missing
 
 __all__ = ["Explanation", "Stage", "explain_frame"]
 
@@ -33,6 +35,8 @@ __all__ = ["Explanation", "Stage", "explain_frame"]
 _FEW, _PLENTY = 8, 30
 # Scales that differ by more are the header's fault; a blind search finds less by itself.
 _SCALE_OFF = 0.03
+# Residuals this many times the errors are worth a word; stated errors are often half the true ones.
+_OVER_ERRORS = 4
 
 
 @dataclass(frozen=True)
@@ -271,6 +275,12 @@ def _tell_solution(story, calibration):
         *(f"lacks: {reason}" for reason in reasons),
         went_well=not reasons,
     )
+    ratio = _over_errors(story.found["match"], residuals)
+    if ratio > _OVER_ERRORS:
+        story.advice.append(
+            f"the residuals are {ratio:.0f} times the expected errors of the positions: check "
+            "how these were measured (focus, trailed stars, errors in the list)"
+        )
     # What more stars would not mend has its own advice.
     if any("no epoch" not in reason for reason in reasons):
         story.advice.append(
@@ -280,17 +290,27 @@ def _tell_solution(story, calibration):
     return story.end(statistics["status"], reasons)
 
 
+def _over_errors(match, residuals):
+    """Ratio of the scatter of the residuals to the errors of sources and reference stars."""
+    i, j = match.pairs
+    source = numbers_or_nan(match.sources, "x_err")[i]
+    star = numbers_or_nan(match.reference, "ra_error")[j] / (3.6e6 * match.start.scale)
+    expected = np.median(np.hypot(source, np.nan_to_num(star)))
+    return min(residuals["sigma_dx"], residuals["sigma_dy"]) / expected
+
+
 def _advise_on_sources(story, error):
     name = shlex.quote(story.frame.source)
+    picture = "" if missing(*PLOT) else " --output look.png"
     if story.frame.load_image is None:
         story.advice.append(f"look at the list: wpdc show {name}")
     elif "sigma on the image" in str(error):
         story.advice.append("if there are faint stars: --threshold 3")
-        story.advice.append(f"look at the image: wpdc show {name} --output look.png")
+        story.advice.append(f"look at the image: wpdc show {name}{picture}")
     elif "signal-to-noise" in str(error):
         story.advice.append("use fainter ones: --min-snr 5; if the gain is wrong, --gain")
     else:
-        story.advice.append(f"look at the image: wpdc show {name} --output look.png")
+        story.advice.append(f"look at the image: wpdc show {name}{picture}")
 
 
 def _advise_on_match(story, stars, sources, error):

@@ -20,9 +20,9 @@ import numpy as np
 from astropy.table import Table, vstack
 
 from wpdc_gwcs.catalogs.cells import cells_in, cells_of, circles_of
-from wpdc_gwcs.catalogs.extras import require
 from wpdc_gwcs.catalogs.files import READ_ERRORS
 from wpdc_gwcs.exceptions import CatalogError
+from wpdc_gwcs.extras import require
 
 __all__ = ["GaiaArchive"]
 
@@ -122,7 +122,7 @@ class GaiaArchive:
             If the archive does not answer, refuses the query or returns only a part of the stars;
             the message says what to do.
         """
-        require("--catalog gaia", "gaia", "pyvo", "astropy_healpix")
+        require("--catalog gaia", "gaia", "pyvo", "astropy_healpix", error=CatalogError)
         cells = cells_in(region, _ORDER)
         folder = self._folder()
         found = {cell: self._kept(folder, cell) for cell in cells.tolist()}

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from wpdc_gwcs.catalogs.cells import cells_in
-from wpdc_gwcs.catalogs.extras import require
 from wpdc_gwcs.catalogs.files import READ_ERRORS
 from wpdc_gwcs.catalogs.pieces import parquet_pieces, part_of
 from wpdc_gwcs.exceptions import CatalogError
+from wpdc_gwcs.extras import require
 
 __all__ = ["HatsCatalog"]
 
@@ -101,7 +101,7 @@ class HatsCatalog:
         list of `~pathlib.Path`
             The files of the partitions that the region touches.
         """
-        require(str(self), "hats", "astropy_healpix")
+        require(str(self), "hats", "astropy_healpix", error=CatalogError)
         files = []
         for order in sorted({order for order, _ in self.partitions}):
             cells = np.array([cell for o, cell in self.partitions if o == order])
@@ -127,7 +127,7 @@ class HatsCatalog:
         CatalogError
             If a partition cannot be read, or has no positions in degrees.
         """
-        require(str(self), "hats", "pyarrow", "astropy_healpix")
+        require(str(self), "hats", "pyarrow", "astropy_healpix", error=CatalogError)
         from wpdc_gwcs.catalogs.standard import known_names
 
         files = self.files_of(region)

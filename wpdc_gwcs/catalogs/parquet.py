@@ -6,7 +6,8 @@ import numpy as np
 from astropy.table import MaskedColumn, Table
 from astropy.table.meta import get_header_from_yaml, get_yaml_from_table
 
-from wpdc_gwcs.catalogs.extras import require
+from wpdc_gwcs.exceptions import CatalogError
+from wpdc_gwcs.extras import require
 
 __all__ = ["LazyColumns", "parquet_groups", "read_parquet", "write_parquet"]
 
@@ -51,7 +52,7 @@ def read_parquet(path):
     CatalogError
         If pyarrow is not installed.
     """
-    require(path, "hats", "pyarrow")
+    require(path, "hats", "pyarrow", error=CatalogError)
     from pyarrow import parquet
 
     with parquet.ParquetFile(path) as file:

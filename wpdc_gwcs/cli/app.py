@@ -17,14 +17,30 @@ from contextlib import contextmanager, suppress
 from typing import Annotated
 
 import typer
+from typer.core import TyperGroup
 
 from wpdc_gwcs.cli.hints import hint_of
 from wpdc_gwcs.exceptions import FrameFailure, InputError, WPDCError, WPDCWarning
 
 __all__ = ["app", "main", "set_verbosity"]
 
+# As they are listed: from frames to results, then what is around it.
+_ORDER = (
+    "calibrate detect match show explain evaluate report export convert pix2sky sky2pix monitor "
+    "catalog simulate demo reproduce"
+).split()
+
+
+class _Commands(TyperGroup):
+    """The commands in the order of the work."""
+
+    def list_commands(self, ctx):
+        return sorted(super().list_commands(ctx), key=_ORDER.index)
+
+
 app = typer.Typer(
     name="wpdc",
+    cls=_Commands,
     help="Calibrate the WCS and the distortion of wide-field frames with a catalog such as Gaia.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

@@ -69,7 +69,11 @@ WcsFile = Annotated[
 ]
 
 
-@app.command("calibrate", no_args_is_help=True)
+@app.command(
+    "calibrate",
+    no_args_is_help=True,
+    epilog="Example: wpdc calibrate image.fits --catalog gaia.fits --output results",
+)
 def calibrate_command(
     frames: Annotated[
         list[str],
@@ -243,7 +247,7 @@ def calibrate_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Calibrate frames: detect, match, fit and write one WCS file each.
+    """Calibrate frames: detect, match, fit, write one WCS file each.
 
     Writes STEM.wcs.asdf and STEM.matches.ecsv for each solved frame (and STEM.sources.ecsv for
     images), DETECTOR.solution.asdf for each detector, CAMERA.camera.asdf for detectors that were

@@ -13,6 +13,7 @@ from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.inputs import expand_paths
 from wpdc_gwcs.cli.options import Cache, Overwrite, Quiet, TapUrl, Verbose, require_free
 from wpdc_gwcs.exceptions import InputError
+from wpdc_gwcs.extras import require
 
 log = logging.getLogger("wpdc_gwcs.cli")
 
@@ -52,7 +53,11 @@ _PURPOSES = {
 }
 
 
-@catalog_app.command("prepare", no_args_is_help=True)
+@catalog_app.command(
+    "prepare",
+    no_args_is_help=True,
+    epilog="Example: wpdc catalog prepare gaia --around image.fits --output gaia.fits",
+)
 def prepare_command(
     catalogs: Annotated[
         list[str],
@@ -138,7 +143,7 @@ def prepare_command(
         typer.echo(f"{len(kept):10d}  written to {output}")
 
 
-@catalog_app.command("info", no_args_is_help=True)
+@catalog_app.command("info", no_args_is_help=True, epilog="Example: wpdc catalog info gaia.fits")
 def info_command(
     catalog: Annotated[str, typer.Argument(metavar="CAT", help="A file, 'gaia' or 'hats:PATH'.")],
     cone: Cone = None,
@@ -149,7 +154,7 @@ def info_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Describe a catalog: sky area, epoch, columns, and the number of stars per magnitude."""
+    """Describe a catalog: area, epoch, columns, stars by magnitude."""
     region, inside = _sky(cone, box, around)
     stars = _read(catalog, region, tap_url=tap_url, cache=cache)
     stars = stars[inside(stars)]
@@ -295,8 +300,6 @@ def _format_of(path):
     if form is None:
         raise InputError(f"{path}: must end with one of {', '.join(_FORMATS)}")
     if form == "parquet":
-        from wpdc_gwcs.catalogs.extras import require
-
         require(path, "hats", "pyarrow")
     return form
 

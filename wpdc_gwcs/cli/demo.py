@@ -17,7 +17,7 @@ from wpdc_gwcs.exceptions import InputError
 DEMO_LIMIT = 0.02
 
 
-@app.command("demo")
+@app.command("demo", epilog="Example: wpdc demo --output demo")
 def demo_command(
     output: Annotated[
         Path, typer.Option("--output", metavar="DIR", help="Folder to write to; made if needed.")
@@ -27,10 +27,11 @@ def demo_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Simulate five exposures of a camera with 40 px of distortion, calibrate them, show the truth.
+    """Simulate and calibrate exposures, and compare with the truth.
 
-    One exposure is an image, four are source lists.  All inputs, results and pictures are kept in
-    the output folder.  The exit status is 1 if the error of the WCS exceeds 0.02 px rms.
+    The camera has 40 px of distortion.  Of five exposures, one is an image and four are source
+    lists.  All inputs, results and pictures are kept in the output folder.  The exit status is 1 if
+    the error of the WCS exceeds 0.02 px rms.
     """
     from wpdc_gwcs.calibration import calibrate
     from wpdc_gwcs.io import read_frames

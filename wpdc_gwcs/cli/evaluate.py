@@ -25,7 +25,7 @@ from wpdc_gwcs.exceptions import FitError, InputError
 _MOST_FRAMES = 40
 
 
-@app.command("evaluate", no_args_is_help=True)
+@app.command("evaluate", no_args_is_help=True, epilog="Example: wpdc evaluate results --no-weights")
 def evaluate_command(
     paths: Annotated[
         list[Path],
@@ -112,7 +112,7 @@ def evaluate_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Print statistics of the residuals of calibrated frames, by detector and by frame.
+    """Print statistics of residuals, by detector and by frame.
 
     With --truth, also print the error of the WCS itself, wrong pairs and pulls.  Finally, compare
     solutions with each of the five radial weights, without and with a table.  This needs the

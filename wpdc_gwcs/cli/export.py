@@ -28,7 +28,11 @@ Degree = Annotated[
 ]
 
 
-@app.command("export", no_args_is_help=True)
+@app.command(
+    "export",
+    no_args_is_help=True,
+    epilog="Example: wpdc export results/image.wcs.asdf --format sip --into image.fits",
+)
 def export_command(
     file: CalibrationFile,
     format: Annotated[
@@ -61,7 +65,10 @@ def export_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Write a calibrated WCS in a format for other programs, and print its deviation."""
+    """Write a WCS in a format for other programs.
+
+    The deviation of the written WCS from the exact one is printed.
+    """
     if format is None and into is not None:
         format = "tpv"
     if format not in FORMATS:
@@ -138,17 +145,17 @@ def write_as(calibration, output, format, *, degree=None, overwrite=False):
 
 
 def _greatest(worst):
-    return "" if worst is None else f" (largest deviation {worst:.2g} px)"
+    return "" if worst is None else f" (greatest deviation {worst:.2g} px)"
 
 
 def _note(made):
     if (made.swarp_deviation or 0.0) > max(_AS_GOOD * (made.deviation or 0.0), _TOLD_PX):
         return (
-            f" (largest deviation {made.deviation:.2g} px, in SWarp {made.swarp_deviation:.2g} px)"
+            f" (greatest deviation {made.deviation:.2g} px, in SWarp {made.swarp_deviation:.2g} px)"
         )
     if made.form != "fits":
         return _greatest(made.deviation)
-    exact = "exact" if made.deviation is None else f"largest deviation {made.deviation:.2g} px"
+    exact = "exact" if made.deviation is None else f"greatest deviation {made.deviation:.2g} px"
     if made.keywords_deviation is None:
         return f" ({exact} for wpdc_gwcs)"
     return (
@@ -157,7 +164,11 @@ def _note(made):
     )
 
 
-@app.command("convert", no_args_is_help=True)
+@app.command(
+    "convert",
+    no_args_is_help=True,
+    epilog="Example: wpdc convert jwst.asdf --to tpv --output jwst.tpv.fits",
+)
 def convert_command(
     file: Annotated[
         str,
@@ -183,7 +194,10 @@ def convert_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Convert the WCS of any file to the models of wpdc, in any format; print the deviation."""
+    """Convert the WCS of any file to the models and formats of wpdc.
+
+    The deviation of the written WCS from the original one is printed.
+    """
     from wpdc_gwcs.camera import Camera
     from wpdc_gwcs.io.any_wcs import read_any
 

@@ -50,7 +50,12 @@ def read_one(file):
     return found
 
 
-@app.command("pix2sky", no_args_is_help=True, context_settings={"ignore_unknown_options": True})
+@app.command(
+    "pix2sky",
+    no_args_is_help=True,
+    context_settings={"ignore_unknown_options": True},
+    epilog="Example: wpdc pix2sky results/image.wcs.asdf 1024 1024",
+)
 def pix2sky_command(
     file: CalibrationFile,
     points: Annotated[
@@ -61,11 +66,19 @@ def pix2sky_command(
     output: Output = None,
     overwrite: Overwrite = False,
 ):
-    """Convert pixels to RA and Dec (ICRS, deg); a table gets the columns ra and dec."""
+    """Convert pixels to RA and Dec (ICRS, deg).
+
+    A table gets the columns ra and dec.  Positions outside the detector become nan.
+    """
     _transform(file, points, origin, output, overwrite, forward=True)
 
 
-@app.command("sky2pix", no_args_is_help=True, context_settings={"ignore_unknown_options": True})
+@app.command(
+    "sky2pix",
+    no_args_is_help=True,
+    context_settings={"ignore_unknown_options": True},
+    epilog="Example: wpdc sky2pix results/image.wcs.asdf 294.63 35.18",
+)
 def sky2pix_command(
     file: CalibrationFile,
     points: Annotated[
@@ -78,7 +91,10 @@ def sky2pix_command(
     output: Output = None,
     overwrite: Overwrite = False,
 ):
-    """Convert RA and Dec to pixels; a table gets the columns x and y.  Off the detector: nan."""
+    """Convert RA and Dec (ICRS, deg) to pixels.
+
+    A table gets the columns x and y.  Positions outside the detector become nan.
+    """
     _transform(file, points, origin, output, overwrite, forward=False)
 
 

@@ -11,6 +11,7 @@ import shlex
 from pathlib import Path
 
 from wpdc_gwcs.exceptions import InternalError
+from wpdc_gwcs.extras import PLOT, missing
 
 __all__ = ["hint_of", "hint_of_frame"]
 
@@ -70,7 +71,7 @@ _OF_COMMANDS = (
     (r"exposure .*left out|all \d+ exposures were left out", "wpdc explain FRAME --catalog CAT"),
 )
 # Reasons of failed frames, and hints.
-_EXPLAIN = "wpdc explain {frame} --catalog {catalog}{wcs} --output why.png"
+_EXPLAIN = "wpdc explain {frame} --catalog {catalog}{wcs}{picture}"
 _OF_FRAMES = (
     (r".*the catalog has no star within", "wpdc catalog prepare gaia --around {frame} --output "
      "gaia.fits"),
@@ -89,7 +90,7 @@ _OF_FRAMES = (
     (r".*its process died", "fewer --jobs, so that each has more memory"),
     (r".*cannot be handed to another process", "--jobs 1"),
     (r".*must be (?:a|an) .*px|.*is a cube|.*centroids 'given'|.*has no rows", None),
-    (r".*image is flat|.*no finite, unmasked pixel", "wpdc show {frame} --output look.png"),
+    (r".*image is flat|.*no finite, unmasked pixel", "wpdc show {frame}{look}"),
     (r".*no source above", "wpdc detect {frame} --threshold 3 --output sources.ecsv"),
     (r".*signal-to-noise ratio above", "--min-snr 5; if the gain is wrong, --gain"),
 )  # fmt: skip
@@ -138,10 +139,13 @@ def hint_of_frame(error, source, *, catalog, wcs=None):
     str or None
         The hint; None if the reason itself says what to do.
     """
+    can_draw = not missing(*PLOT)
     parts = {
         "frame": shlex.quote(source),
         "catalog": shlex.quote(catalog),
         "wcs": "" if wcs is None else f" --wcs {shlex.quote(wcs)}",
+        "picture": " --output why.png" if can_draw else "",
+        "look": " --output look.png" if can_draw else "",
     }
     for pattern, hint in _OF_FRAMES:
         if re.match(pattern, str(error), re.DOTALL):

@@ -18,7 +18,11 @@ _MOST_PERIODS = 40
 _MOST_CELLS = 5
 
 
-@app.command("monitor", no_args_is_help=True)
+@app.command(
+    "monitor",
+    no_args_is_help=True,
+    epilog="Example: wpdc monitor ccd1.solution.asdf tonight --every 1 --output drift.ecsv",
+)
 def monitor_command(
     solution: Annotated[
         Path,
@@ -62,11 +66,12 @@ def monitor_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Test whether a stored solution is still valid.  The exit status is 1 if it is not.
+    """Test whether a stored solution is still valid.
 
-    The frames must have been calibrated with it: wpdc calibrate --solution SOLUTION.  The part of
-    a change that the fields of single exposures have absorbed is added back.  All detectors of a
-    camera are tested, and --false-alarm is shared by all detectors and periods.
+    The exit status is 1 if it is not.  The frames must have been calibrated with it: wpdc calibrate
+    --solution SOLUTION.  The part of a change that the fields of single exposures have absorbed is
+    added back.  All detectors of a camera are tested, and --false-alarm is shared by all detectors
+    and periods.
     """
     from wpdc_gwcs.calibration.names import file_stem
     from wpdc_gwcs.io import write_table

@@ -4,7 +4,6 @@ import logging
 import math
 import tomllib
 from importlib.resources import files
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +11,7 @@ import typer
 
 from wpdc_gwcs.cli.app import set_verbosity
 from wpdc_gwcs.exceptions import InputError
+from wpdc_gwcs.extras import PLOT, require
 
 __all__ = [
     "Blind",
@@ -231,7 +231,12 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing f
 Verbose = Annotated[
     int,
     typer.Option(
-        "-v", "--verbose", count=True, help="Print progress (-vv: details).", callback=_verbose
+        "-v",
+        "--verbose",
+        count=True,
+        help="Print progress (-vv: details).",
+        callback=_verbose,
+        show_default=False,
     ),
 ]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.", callback=_quiet)]
@@ -366,9 +371,4 @@ def require_plotting(what):
     what : str
         What needs them, for the message.
     """
-    missing = [name for name in ("matplotlib", "jinja2") if find_spec(name) is None]
-    if missing:
-        raise InputError(
-            f"{what} needs {' and '.join(missing)}, not installed here: "
-            "pip install 'wpdc_gwcs[plot]'"
-        )
+    require(what, "plot", *PLOT)

@@ -12,7 +12,7 @@ from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import FileFormatError
 
 
-@app.command("report", no_args_is_help=True)
+@app.command("report", no_args_is_help=True, epilog="Example: wpdc report results")
 def report_command(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of wpdc calibrate.")],
     output: Annotated[

@@ -12,7 +12,9 @@ from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.exceptions import InputError
 
 
-@app.command("reproduce", no_args_is_help=True)
+@app.command(
+    "reproduce", no_args_is_help=True, epilog="Example: wpdc reproduce all --output paper --quick"
+)
 def reproduce_command(
     part: Annotated[
         str,
@@ -37,10 +39,10 @@ def reproduce_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Make the tables and figures of the paper, with the literal method and the default one.
+    """Reproduce the tables and figures of the paper.
 
-    Writes a folder for each part, and results.ecsv with the numbers of the paper, of its exact
-    method, and of the default method.
+    Both the literal and the default method are used.  Writes a folder for each part, and
+    results.ecsv with the numbers of the paper, of its exact method, and of the default method.
     """
     from wpdc_gwcs.reproduction import FULL, PARTS, QUICK, reproduce
 

@@ -40,7 +40,11 @@ Picture = Annotated[
 _MOST_ROWS = 20
 
 
-@app.command("show", no_args_is_help=True)
+@app.command(
+    "show",
+    no_args_is_help=True,
+    epilog="Example: wpdc show results/image.wcs.asdf --output look.png",
+)
 def show_command(
     file: Annotated[
         str,
@@ -61,7 +65,11 @@ def show_command(
         _save(draw(), output, overwrite=overwrite)
 
 
-@app.command("explain", no_args_is_help=True)
+@app.command(
+    "explain",
+    no_args_is_help=True,
+    epilog="Example: wpdc explain image.fits --catalog gaia.fits --output why.png",
+)
 def explain_command(
     frame: Annotated[
         str,
@@ -84,9 +92,10 @@ def explain_command(
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
 ):
-    """Explain why a frame is solved, degraded or refused, stage by stage, and what to try.
+    """Explain the result of a frame, stage by stage, and what to try.
 
-    The frame is solved by itself, without others of its camera.  The exit status is 1 if it fails.
+    This tells why a frame is solved, degraded or refused.  The frame is solved by itself, without
+    others of its camera.  The exit status is 1 if it fails.
     """
     from wpdc_gwcs.catalogs import catalog_source
     from wpdc_gwcs.explanation import explain_frame

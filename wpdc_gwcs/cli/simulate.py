@@ -15,7 +15,11 @@ from wpdc_gwcs.exceptions import InputError
 _MOST_NAMED = 8
 
 
-@app.command("simulate", no_args_is_help=True)
+@app.command(
+    "simulate",
+    no_args_is_help=True,
+    epilog="Example: wpdc simulate --output sky --exposures 3 --distortion 40",
+)
 def simulate_command(
     output: Annotated[
         Path, typer.Option("--output", metavar="DIR", help="Folder to write to; made if needed.")
@@ -157,7 +161,7 @@ def simulate_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Simulate exposures with a known distortion: frames, a reference catalog, and the truth.
+    """Simulate exposures with a known distortion, and a catalog.
 
     Writes images or source lists, CAMERA-reference.fits, truth.asdf (an exact WCS for each frame)
     and STEM.truth.ecsv (star by star), and prints the command that calibrates them.  wpdc evaluate

@@ -64,7 +64,9 @@ def one_frame(path, **options):
     return frames[0]
 
 
-@app.command("detect", no_args_is_help=True)
+@app.command(
+    "detect", no_args_is_help=True, epilog="Example: wpdc detect image.fits --output sources.ecsv"
+)
 def detect_command(
     frame: Annotated[str, typer.Argument(metavar="IMAGE", help="FITS image, path or path[EXT].")],
     output: Table,
@@ -102,7 +104,11 @@ def detect_command(
         typer.echo(f"{output}: {counted(len(sources), 'source')}, {clean} of them without flags")
 
 
-@app.command("match", no_args_is_help=True)
+@app.command(
+    "match",
+    no_args_is_help=True,
+    epilog="Example: wpdc match image.fits --catalog gaia.fits --output pairs.ecsv",
+)
 def match_command(
     frame: Annotated[
         str,
@@ -129,7 +135,10 @@ def match_command(
     verbose: Verbose = 0,
     quiet: Quiet = False,
 ):
-    """Match the sources of a frame to a catalog; exit status 1 without enough evidence."""
+    """Match the sources of a frame to a catalog.
+
+    The exit status is 1 if there is not enough evidence for a match.
+    """
     import numpy as np
 
     from wpdc_gwcs.calibration import match_frame

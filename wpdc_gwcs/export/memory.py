@@ -51,7 +51,7 @@ class InMemory:
             header["NAXIS2"] = (int(shape[0]), "[pixel] height of the detector")
         header.extend(made.header, end=True)
         if made.deviation is not None:
-            header["WPDCDEV"] = (made.deviation, "[pixel] largest deviation")
+            header["WPDCDEV"] = (made.deviation, "[pixel] greatest deviation")
         return header
 
     def to_astropy_wcs(self, format="tpv", *, degree=None):

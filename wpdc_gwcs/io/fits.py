@@ -77,7 +77,7 @@ def write_form(obj, path, *, form, degree=None, overwrite=False):
     header = made.header.copy()
     header.extend(frame_cards(obj), strip=False, end=True)
     if made.deviation is not None:
-        add_history(header, f"largest deviation from the exact WCS: {made.deviation:.3g} px")
+        add_history(header, f"greatest deviation from the exact WCS: {made.deviation:.3g} px")
     if made.inverse_deviation is not None:
         add_history(header, f"that of the inverse polynomials: {made.inverse_deviation:.3g} px")
     if made.swarp_deviation is not None:

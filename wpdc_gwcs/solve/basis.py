@@ -1,4 +1,4 @@
-"""What fields are made of: sine waves on a patch of the focal plane, and a few polynomials."""
+"""Basis functions of fields: sine waves on a patch of the focal plane, and polynomials."""
 
 from dataclasses import dataclass
 
@@ -9,16 +9,16 @@ from wpdc_gwcs.solve.terms import legendre_products
 __all__ = ["BEND_DEGREES", "Basis", "patch"]
 
 # The patch is this much larger than the part of the focal plane where stars are used: the waves
-# vanish at its rim.
+# vanish at its edge.
 _PATCH = 1.2
 
-# Degrees of the polynomials: what changes with focus, filter and flexure, and is no turbulence.
+# Degrees of the polynomials, for changes by focus, filter and flexure, not turbulence.
 BEND_DEGREES = (2, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Sine waves on a rectangle of the focal plane, and low polynomials where they are asked for.
+    """Sine waves on a rectangle of the focal plane, and optional low-degree polynomials.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class Basis:
     orders : (2, M) ndarray of int
         Half waves along each axis, in the order of growing wave number.
     bends : bool
-        Whether polynomials of degree 2 and 3 are part of it.
+        Whether polynomials of degree 2 and 3 are included.
     """
 
     center: np.ndarray
@@ -41,7 +41,7 @@ class Basis:
         return 0.5 * np.pi * self.orders / self.half[:, None]
 
     def shapes(self, focal, kind="curl-free"):
-        """Displacements of unit coefficients, ``(K, 2, N)``: K is M or 2 M, and 2, and 14 of bends.
+        """Return the displacements of unit coefficients, ``(K, 2, N)``.
 
         Parameters
         ----------
@@ -53,8 +53,8 @@ class Basis:
         Returns
         -------
         ndarray
-            Waves first, then polynomials, degree by degree along each axis; the last two are a
-            constant along each axis.
+            M or 2 M waves first, then 14 polynomials if there are bends, degree by degree along
+            each axis; the last two are a constant along each axis.
         """
         phases = [
             np.outer(
@@ -93,7 +93,7 @@ class Basis:
 
 
 def patch(low, high, n_waves, *, bends=False):
-    """Waves for the part of the focal plane between two corners.
+    """Build the basis for the part of the focal plane between two corners.
 
     Parameters
     ----------
@@ -102,16 +102,16 @@ def patch(low, high, n_waves, *, bends=False):
     n_waves : int
         Waves to keep, the longest ones.
     bends : bool, optional
-        Whether polynomials of degree 2 and 3 are to be part of it.
+        Whether to include polynomials of degree 2 and 3.
 
     Returns
     -------
     Basis
-        On a rectangle that is a fifth larger.
+        Basis on a rectangle that is a fifth larger.
     """
     low, high = np.asarray(low, float), np.asarray(high, float)
     half = 0.5 * _PATCH * (high - low)
-    # Enough orders along each axis that the shortest side does not run out of them.
+    # Enough orders along each axis, even for the shortest side.
     reach = 2 * np.sqrt(n_waves / np.pi / np.prod(half)) * half * 1.3 + 2
     j, k = (a.ravel() for a in np.meshgrid(*(np.arange(1, int(r) + 2) for r in reach)))
     order = np.argsort((j / half[0]) ** 2 + (k / half[1]) ** 2, kind="stable")[:n_waves]

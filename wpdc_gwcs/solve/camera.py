@@ -1,4 +1,4 @@
-"""The solution of a camera: arguments in, frozen results out."""
+"""The solution of a camera."""
 
 import logging
 from dataclasses import replace
@@ -29,26 +29,26 @@ __all__ = ["solve"]
 
 log = logging.getLogger(__name__)
 
-# Largest degrees tried where the user does not say: of one detector, of a detector of a mosaic, and
-# of the optics of a mosaic.
+# Default maximum degrees: of a single detector, of a detector of a mosaic, and of the optics of a
+# mosaic.
 _DEGREE_ALONE = 7
 _DEGREE_MOSAIC = 5
 _DEGREE_OPTICS = 9
 
-# Degree of the delivered polynomial; what it leaves is in the table.
+# Degree of the delivered polynomial; the rest is in the table.
 _PV_DEGREE = 3
 
-# Steps of the alternation.
+# Number of alternating steps.
 _ROUNDS_ALIGN = 6
 _ROUNDS_FIELD = 2
-# Before their waves are known, the errors of the stars seem larger than they are.
+# Before the waves are known, the errors of the stars are overestimated.
 _ROUNDS_WAVES = 2
 
 # How much larger residuals may be in one part of the detector than elsewhere before they are
 # taken for outliers, once the instrument is known.
 _MAX_LOCAL_SCALE = 10.0
 
-# Steps of the variances' learning in each linear step.
+# Updates of the variances in each linear step.
 _LEARN = 12
 
 _REFINE = ("auto", "attitude", "field", "pv")
@@ -182,7 +182,7 @@ def solve(
     o = gather(exposures, shapes, points)
     weights = _weights(weight, names, shapes, lut)
     pv_degree = _PV_DEGREE if degree == "auto" else int(degree)
-    # Without a table nothing takes what the delivered polynomial cannot.
+    # Without a table, the delivered polynomial has to describe everything.
     state = _start(o, pv_degree if lut == "none" else degree, stored)
     state = _align(o, state, clip, pool_attitudes)
     group = folds(o, seed)
@@ -199,10 +199,10 @@ def solve(
         state, infos = with_tables(o, state, group, n_grid, lut, choices=choices, draft=True)
         if any(table is not None for table in state.model.tables):
             state = with_error_models(o, _settled(o, state, clip, pool_attitudes))
-    # In a mosaic the neighbors' stars tell how an exposure bends; of an update it may be the
+    # In a mosaic the stars of neighbors tell how an exposure bends; in an update it may be the
     # instrument that does.
     bends = len(o.detectors) == 1 and not update
-    # Without a table there is nothing to write a field down in, unless it is asked for.
+    # Without a table there is no place for a field, unless it is requested.
     if refine == "field" or (refine == "auto" and lut != "none"):
         for _ in range(_ROUNDS_FIELD):
             state = with_spectra(o, state, force=refine == "field", bends=bends)
@@ -211,7 +211,7 @@ def solve(
             state = linear_step(o, state, learn=_LEARN, pool=pool_attitudes)
             state = with_fields(o, state)
             state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE)
-            # What was scatter before is field now: the errors are smaller than they seemed.
+            # Former scatter is now part of the field, so the errors are smaller.
             state = with_error_models(o, state)
             if waves:
                 state = with_statics(o, state)
@@ -238,7 +238,7 @@ def solve(
 
 
 def _solve_apart(exposures, stored, options):
-    """Solve detectors with a stored solution, and those without, as two cameras."""
+    """Solve detectors with and without a stored solution as two cameras."""
     known = [e for e in exposures if e.detector in stored]
     others = [e for e in exposures if e.detector not in stored]
     first = solve(known, solution=stored, **options)
@@ -300,7 +300,7 @@ def _weights(weight, names, shapes, lut):
 
 
 def _start(o, degree, stored):
-    """State before anything is solved."""
+    """Build the state before any solution."""
     mosaic = len(o.detectors) > 1
     chosen = []
     if not stored:
@@ -370,6 +370,6 @@ def _updated(o, state, stored, group, n_grid, force):
     model = state.model.changed(tables=tuple(tables), fields={})
     state = replace(state, model=model)
     if any(state.spectra.values()):
-        # What the fields had taken of a change is the instrument's now.
+        # The part of a change that fields had absorbed now belongs to the instrument.
         state = linear_step(o, with_spectra(o, state, force=force, bends=False), learn=1)
     return state, stored, infos

@@ -1,4 +1,4 @@
-"""What new exposures have in common beyond a stored solution: a change of the instrument.
+"""Common residuals of new exposures about a stored solution: a change of the instrument.
 
 ::
 
@@ -18,17 +18,17 @@ from wpdc_gwcs.solve.strength import FieldPrior, log_strength
 
 __all__ = ["AGAINST_CHANGE", "POINTS", "Change", "find_change"]
 
-# Waves of a change, and stars for each.
+# Number of waves of a change, and stars needed for each.
 _MOST_WAVES, _STARS_PER_WAVE = 120, 2
 
-# Log evidence that a change must have beyond that of the exposures' own fields, nats.
+# Log evidence required for a change beyond that of the fields of exposures, nats.
 AGAINST_CHANGE = 3.0
 
 # What is learned about a change's spectrum beyond that (two numbers): a false alarm is then rarer
 # than one in a thousand.
 _LEAST_GAIN = 3.0
 
-# Exposures whose fields tell the spectrum.
+# Number of exposures whose fields determine the spectrum.
 _EXPOSURES_TRIED = 12
 
 # The uncertainty of a stored map is itself an estimate: maps of a few turbulent exposures are wrong
@@ -36,7 +36,7 @@ _EXPOSURES_TRIED = 12
 # polynomial of degree 7 where there is no table.
 _STALE_MARGIN, _FREEDOM = 2.0, 36.0
 
-# Points along each axis on which a change is averaged.
+# Points along each axis for the average of a change.
 POINTS = 24
 
 
@@ -49,15 +49,15 @@ class Change:
     basis : Basis
         Waves, for each axis.
     coefficients : (2, M + 3) ndarray
-        Of the waves, and of the linear part that attitudes take from them.
+        Coefficients of the waves, and of the linear part that attitudes absorb.
     half : (2, M, M + 3) ndarray
-        Products of these with themselves, H^T H, are the covariances.
+        Halves H of the covariances, which are H^T H.
     variance : float
         Variance added to the stored map along each axis (process noise), px^2; 0 for no change.
     gain : float
         Log evidence over that of no change, nats.
     field : Spectrum or None
-        Of the exposures' own fields.
+        Spectrum of the fields of exposures.
     """
 
     basis: Basis
@@ -103,7 +103,7 @@ def _power(spectrum, basis):
 
 
 def find_change(o, state, k, stored):
-    """Find what the new exposures of a detector have in common beyond a stored solution.
+    """Find the common residuals of new exposures of a detector about a stored solution.
 
     Parameters
     ----------
@@ -119,10 +119,10 @@ def find_change(o, state, k, stored):
     Returns
     -------
     change : Change
-        What the evidence says, of the variance 0 if it speaks for none: then what the stored
-        solution may well have been wrong by.
+        The change by evidence; with variance 0 if there is none, it is the likely error of the
+        stored solution.
     common : Change
-        What the exposures have in common whatever the evidence, not drawn to zero.
+        The common residuals whatever the evidence, without shrinkage.
 
     Notes
     -----
@@ -161,7 +161,7 @@ def find_change(o, state, k, stored):
 
 
 def _without_linear(basis, focal, coefficients, half):
-    """Waves and linear columns of a change without what attitudes take of it, over a detector."""
+    """Waves and linear columns of a change without the part that attitudes absorb."""
     rows, free = _waves(basis, focal), _linear(basis, focal)
     taken = np.linalg.lstsq(free, rows, rcond=None)[0].T
     return (
@@ -198,7 +198,7 @@ def _stale_power(stored, basis, detector):
 
 
 def _normal(o, state, f, basis, known):
-    """Accumulate the normal equations of a frame along both axes, its attitude taken out."""
+    """Accumulate the normal equations of a frame along both axes, without its attitude."""
     s = o.slices[f]
     kept = state.kept[s]
     residual, focal = residuals(state.model, o, f, with_field=False)
@@ -221,7 +221,7 @@ def _normal(o, state, f, basis, known):
 
 
 def _spectra(products, basis, prior, errors, scales, stale):
-    """Spectra of fields and change of the largest evidence, and its gain over no change."""
+    """Spectra of fields and change with the largest evidence, and its gain over no change."""
     low, high = scales
 
     def spectrum(p):
@@ -267,7 +267,7 @@ def _spectra(products, basis, prior, errors, scales, stale):
 
 
 def _marginal(normal, right, power):
-    """Return what a field leaves of normal equations, and the log evidence of the field."""
+    """Marginalize a field from normal equations; return these and its log evidence."""
     root = np.sqrt(power)
     inner = normal * root[:, None] * root
     inner[np.diag_indices_from(inner)] += 1.0

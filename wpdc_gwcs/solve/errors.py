@@ -1,4 +1,4 @@
-"""Errors of pairs: what is clipped, how large they are, how much attitudes vary."""
+"""Errors of pairs: clipping, error model, scatter of attitudes."""
 
 import numpy as np
 from scipy.optimize import nnls
@@ -34,7 +34,7 @@ _GROWTH, _FARTHEST, _ENOUGH_STARS = 0.5, 3.0, 100
 
 
 def worse_scatter(values):
-    """Robust scatter about zero of the worse of two axes.
+    """Return the robust scatter about zero of the worse of two axes.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def worse_scatter(values):
 
 
 def clip_outliers(observations, residual, sigma, leverage, clip, *, local=np.inf, relax=1.0):
-    """Decide which pairs are kept.
+    """Clip outliers.
 
     Parameters
     ----------
@@ -54,8 +54,7 @@ def clip_outliers(observations, residual, sigma, leverage, clip, *, local=np.inf
     residual, sigma : (2, N) ndarray
         Residuals and their errors, px.
     leverage : (2, N) ndarray
-        Share of its own variance that the model predicts a star's residual with: of a star that is
-        fitted, the hat matrix; 0 where it is negligible.
+        Leverage of each star: the diagonal of the hat matrix for fitted stars; 0 if negligible.
     clip : float
         Limit in robust standard deviations.
     local : float, optional
@@ -108,12 +107,12 @@ def clip_outliers(observations, residual, sigma, leverage, clip, *, local=np.inf
 
 
 def error_model(residual, sigma, *, stated, freedom):
-    """Scale s and floor f of the errors: robust variance of the residuals = (s sigma)^2 + f^2.
+    """Fit scale s and floor f of the errors: robust variance = (s sigma)^2 + f^2.
 
     Parameters
     ----------
     residual, sigma : (2, N) ndarray
-        Residuals, inflated for what the fit took, and their errors.
+        Residuals, inflated for the degrees of freedom of the fit, and their errors.
     stated : bool
         Whether the errors were given: then there is a floor, and few stars do not overrule them.
     freedom : float
@@ -122,7 +121,7 @@ def error_model(residual, sigma, *, stated, freedom):
     Returns
     -------
     scale, floor : float
-        Of the errors.
+        Scale and floor of the errors.
 
     Notes
     -----
@@ -143,7 +142,7 @@ def error_model(residual, sigma, *, stated, freedom):
     else:
         scale2, floor2 = np.median(v / e2), 0.0
     if scale2 <= 0:
-        # Errors that say nothing about the residuals.
+        # The errors are unrelated to the residuals.
         scale2 = 1e-6
     if stated:
         share = freedom / (freedom + _STATED_FREEDOM)
@@ -152,7 +151,7 @@ def error_model(residual, sigma, *, stated, freedom):
 
 
 def frame_scale(pull, freedom):
-    """Scale of the errors of one frame over those of all: its seeing was better or worse.
+    """Return the scale of the errors of one frame relative to all, for its seeing.
 
     Parameters
     ----------
@@ -171,12 +170,12 @@ def frame_scale(pull, freedom):
 
 
 def extrapolation(stars, places):
-    """Factors of the standard deviations of a distortion for the distance to its stars.
+    """Return factors on the uncertainty of a distortion by the distance to its stars.
 
     Parameters
     ----------
     stars, places : (2, N) ndarray
-        Where the stars are and where factors are wanted, -1 to 1 along each side of the detector.
+        Positions of stars, and positions for the factors, -1 to 1 along each side of the detector.
 
     Returns
     -------
@@ -192,7 +191,7 @@ def extrapolation(stars, places):
 
 
 def repetition(star, variance, reference):
-    """Factor of the variance of what exposures share, for reference stars that they share, too.
+    """Return the factor on the variance of shared terms for shared reference stars.
 
     Parameters
     ----------
@@ -206,18 +205,18 @@ def repetition(star, variance, reference):
     Returns
     -------
     float
-        1 where no star is there twice or references have no errors; at most the number of times
-        that stars are there.
+        1 if no star occurs twice or references have no errors; at most the number of times that
+        stars occur.
 
     Notes
     -----
-    Whatever is the same in all exposures learns from a star of n pairs no more than the mean of
-    them tells, whose variance is that of the reference, and a share of 1/n of the others'.
+    A star with n pairs contributes to shared terms only the mean of its pairs, whose variance is
+    that of the reference plus 1/n of the remaining variance.
     """
     if not len(star):
         return 1.0
     _, number = np.unique(star, return_inverse=True)
-    # Unknown stars are stars of their own.
+    # Unknown stars count as different stars.
     alone = star < 0
     number[alone] = number.max() + 1 + np.arange(np.count_nonzero(alone))
     centroid = np.bincount(number, 1.0 / np.maximum(variance * (1.0 - reference), 1e-300))
@@ -228,19 +227,19 @@ def repetition(star, variance, reference):
 
 
 def linear_scatter(b, covariance):
-    """Variances and means of the modes of the exposures' linear maps.
+    """Estimate variances and means of the modes of the linear maps of exposures.
 
     Parameters
     ----------
     b : (E, 2, 2) ndarray
-        Linear maps of the exposures less unity.
+        Linear maps of the exposures minus unity.
     covariance : (E, 6, 6) ndarray
-        Of (ax, bxx, bxy, ay, byx, byy).
+        Covariance of (ax, bxx, bxy, ay, byx, byy).
 
     Returns
     -------
     variance, mean : (4,) ndarray
-        Of scale, rotation, stretch and shear.
+        Variance and mean of scale, rotation, stretch and shear.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""Exposures as they go into the solution, and as they come out."""
+"""Exposures as input and output of the solution."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ __all__ = ["Exposure", "ExposureFit", "SolveResult"]
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """Pairs of one exposure of one detector, and where it was thought to point.
+    """Pairs of one exposure of one detector, with its starting attitude.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Exposure:
     reference_err : (N,) array_like, optional
         Share of the reference positions in these errors, px; 0 if not given.
     star : (N,) array_like of int, optional
-        Which star each pair is of, 0 or more: the same number in every exposure that has it.
+        Number of the star of each pair, 0 or more, the same in all exposures.
     use : (N,) array_like of bool, optional
         Stars that may be fitted; the others (held out) only get residuals.
     color : (N,) array_like, optional
@@ -41,7 +41,7 @@ class Exposure:
     detector : str, optional
         Name of the detector.
     exposure : hashable, optional
-        What the frames of one exposure of a mosaic have in common; on its own if not given.
+        Identifier that the frames of one exposure of a mosaic share; not shared by default.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Exposure:
 
 @dataclass(frozen=True, eq=False)
 class ExposureFit:
-    """What the solution found for one exposure of one detector.
+    """Solution for one exposure of one detector.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class ExposureFit:
     color_shift : (2, 3) ndarray or None
         Displacement of stars per magnitude of color in undistorted px: constant and linear part.
     reference_offset : (2, N) ndarray or None
-        Where free reference stars were found to the east and to the north of the catalog, mas.
+        Offsets of free reference stars east and north of the catalog, mas.
     reason : str or None
         Why the exposure was left out; its numbers are then the starting values.
     statistics : dict
@@ -128,13 +128,13 @@ class SolveResult:
     Parameters
     ----------
     solutions : dict
-        Name of a detector to its `DistortionSolution`.
+        `DistortionSolution` of each detector, by name.
     exposures : tuple of ExposureFit
         One per frame given, in that order.
     rejected : dict of str
         Names of the frames that were left out, and why.
     table_infos : dict
-        Name of a detector to its `TableInfo`; no entry where there was no table to be made.
+        `TableInfo` of each detector, by name; no entry without a table.
     reference_color : float or None
         Color that the solution is for; `None` if no colors were given.
     """
@@ -156,5 +156,5 @@ class SolveResult:
 
     @property
     def table_info(self):
-        """How the table of the only detector came about, or None."""
+        """`TableInfo` of the only detector, or None."""
         return next(iter(self.table_infos.values()), None)

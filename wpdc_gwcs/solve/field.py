@@ -1,8 +1,8 @@
 """The field of an exposure: a smooth random displacement of the focal plane.
 
 The atmosphere shifts the stars of one exposure by a few hundredths of a pixel, alike over minutes
-of arc; focus, filter and flexure bend it.  That is a Gaussian process with the spectrum of von
-Karman, written as a sum of sine waves on a patch a little larger than the detector, and a few
+of arc; focus, filter and flexure bend it.  This is a Gaussian process with a von Karman
+spectrum, written as a sum of sine waves on a patch a little larger than the detector, and a few
 polynomials: the waves are the shapes of a linear model, the spectrum is the prior of their
 coefficients, and so the field is one more term with a prior.
 
@@ -48,7 +48,7 @@ class Field:
     freedom: float
 
     def __call__(self, focal):
-        """Displacement ``(2, N)`` at focal plane positions, px.
+        """Return the displacement ``(2, N)`` at focal plane positions, px.
 
         Parameters
         ----------
@@ -64,16 +64,16 @@ class Field:
         return (self.coefficients @ shapes.reshape(len(shapes), -1)).reshape(2, -1)
 
     def conditioned(self, focal, rows, focal_stars, star_rows, weight):
-        """Rows of other terms less what the field follows, and the field's own covariance.
+        """Return rows of other terms minus the response of the field, and its covariance.
 
         Parameters
         ----------
         focal : (2, N) ndarray
-            Places of the rows, px.
+            Positions of the rows, px.
         rows : (2, N, P) ndarray
             Columns of the other terms there.
         focal_stars : (2, S) ndarray
-            Places of the stars behind the field, px.
+            Positions of the stars of the field, px.
         star_rows : (2, S, P) ndarray
             Columns of the other terms there.
         weight : (2, S) ndarray
@@ -82,9 +82,9 @@ class Field:
         Returns
         -------
         rows : (2, N, P) ndarray
-            The field takes a part of what any other term does at the stars.
+            Rows without the part that the field absorbs at the stars.
         covariance : (2, 2, N) ndarray
-            Of the field, the other terms fixed, with what the waves are too long for.
+            Covariance of the field with the other terms fixed, including unresolved waves.
         """
         weight = 1.0 / (1.0 / weight + self.spectrum.unresolved(self.basis))
         waves = self._scaled(focal_stars)
@@ -95,7 +95,7 @@ class Field:
         return rows - (here.T @ solved).reshape(rows.shape), self._covariance(here)
 
     def covariance(self, focal):
-        """Posterior covariance, with what the waves are too long for.
+        """Return the posterior covariance, including unresolved waves.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class Field:
 
 
 def fit_field(basis, spectrum, focal, residual, variance):
-    """Posterior of a field with a known spectrum.
+    """Return the posterior of a field with a known spectrum.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def fit_field(basis, spectrum, focal, residual, variance):
     spectrum : Spectrum
         Prior.
     focal, residual, variance : (2, N) ndarray
-        Places, residuals and their variances without the field, px.
+        Positions, residuals and their variances without the field, px.
 
     Returns
     -------
@@ -159,5 +159,5 @@ def fit_field(basis, spectrum, focal, residual, variance):
     coefficients = root * lapack.dpotrs(lower, right, lower=1)[0]
     inverse, _ = lapack.dtrtri(lower, lower=1)
     freedom = (len(root) - np.sum(inverse**2)) / max(focal.shape[1], 1)
-    # A camera has a thousand of these, and no error is known to seven digits.
+    # Single precision: a camera has a thousand of these, and errors need no seven digits.
     return Field(basis, spectrum, coefficients, lower.astype(np.float32), float(freedom))

@@ -32,7 +32,7 @@ _TABLE_ALONE = 6000
 # Waves of what the exposures of a detector share, and stars that its spectrum is learned from.
 _MOST_STATIC, _STARS_POOLED = 300, 10_000
 
-# Frames of an exposure that its spectrum is learned from, those with the most stars.
+# Frames of an exposure from which its spectrum is learned, those with the most stars.
 _FRAMES_PER_EXPOSURE = 6
 
 # Largest outer scale in units of the patch; of one exposure alone, whose polynomial is free, the
@@ -66,16 +66,16 @@ def with_spectra(o, state, *, force=False, bends=True):
     o : Observations
         Pairs.
     state : State
-        Where the solution stands; its fields are not looked at.
+        Current solution; its fields are ignored.
     force : bool, optional
         Give every exposure a field, whatever the evidence.
     bends : bool, optional
-        Whether exposures may have polynomials beside the waves.
+        Whether exposures may have polynomials in addition to waves.
 
     Returns
     -------
     State
-        Exposures whose stars do not speak for a field have none.
+        State in which exposures without evidence for a field have none.
     """
     counts = np.array([state.kept[s].sum() for s in o.slices])
     bases = {}
@@ -121,7 +121,7 @@ def _products(o, state, f, basis: Basis, kinds):
     variance = state.noise(o, f)[:, kept]
     nuisance = None
     if len(o.detectors) == 1:
-        # A single exposure's polynomial has taken what it could of the field.
+        # The polynomial of a single exposure has absorbed a part of the field.
         columns = design(state.model, o, f, o.x[s][kept], o.y[s][kept], o.color[s][kept])
         own = sum(t.size for t in state.model.scoped("exposure"))
         nuisance = columns if o.n_exposures == 1 else columns[:, :, -own:]

@@ -66,7 +66,7 @@ def without_aliens(o, state):
         if len(scatter) > 2 and value > max(_ALIEN_RATIO * typical, _ALIEN_SCATTER):
             reasons[f] = (
                 f"its residuals scatter by {value:.3g} px, those of the others by "
-                f"{typical:.3g} px: wrong pairs"
+                f"{typical:.3g} px: wrong pairs or bad positions"
             )
     return _left_out(o, state, reasons)
 
@@ -103,11 +103,13 @@ def without_wrong(o, state):
         if f not in scatter:
             reasons[f] = "none of its pairs can be used"
         elif scatter[f] > _MAX_SCATTER:
-            reasons[f] = f"its residuals scatter by {scatter[f]:.3g} px: wrong pairs"
+            reasons[f] = (
+                f"its residuals scatter by {scatter[f]:.3g} px: wrong pairs or bad positions"
+            )
         elif len(scatter) > 2 and scatter[f] > max(_REJECT_RATIO * typical, 0.1):
             reasons[f] = (
                 f"its residuals scatter by {scatter[f]:.3g} px, those of the others by "
-                f"{typical:.3g} px: wrong pairs"
+                f"{typical:.3g} px: wrong pairs or bad positions"
             )
     return _left_out(o, state, reasons)
 
