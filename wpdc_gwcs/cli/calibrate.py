@@ -11,6 +11,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.completion import complete, one_of
 from wpdc_gwcs.cli.hints import hint_of_frame
 from wpdc_gwcs.cli.inputs import expand_paths
 from wpdc_gwcs.cli.options import (
@@ -127,7 +128,7 @@ def calibrate_command(
     refine: Annotated[
         str,
         typer.Option(
-            metavar="{auto,attitude,field,pv}",
+            **one_of("auto", "attitude", "field", "pv"),
             help="Fit for each exposure: six linear numbers (attitude), also a smooth field if "
             "there is evidence (auto) or always (field), or a polynomial (pv).",
         ),
@@ -143,7 +144,7 @@ def calibrate_command(
     method: Annotated[
         str,
         typer.Option(
-            metavar="{wpdc,paper}",
+            **one_of("wpdc", "paper"),
             help="One solution of all exposures (wpdc), or WPDC-2P exactly as published (paper): "
             "a polynomial per exposure, raw residuals in a bilinear table.",
         ),
@@ -152,13 +153,14 @@ def calibrate_command(
         str,
         typer.Option(
             metavar="{auto,1...7}",
+            autocompletion=complete("auto", *"1234567"),
             help="Degree of the polynomial; auto: by evidence, stored as a cubic and a table.",
         ),
     ] = "auto",
     lut: Annotated[
         str,
         typer.Option(
-            metavar="{auto,none}",
+            **one_of("auto", "none"),
             help="Look-up table for the residuals of the polynomial (auto), or the polynomial "
             "alone (none).",
         ),
@@ -167,6 +169,17 @@ def calibrate_command(
         str,
         typer.Option(
             metavar="NAME",
+            autocompletion=complete(
+                "exp-sqrt",
+                "gaussian",
+                "inverse",
+                "inverse-square",
+                "uniform",
+                "w1",
+                "w2",
+                "w3",
+                "w4",
+            ),
             help="Radial weight of the polynomial; the table contains the rest: exp-sqrt, "
             "gaussian, inverse, inverse-square (w1 to w4 of the paper) or uniform.",
         ),
@@ -184,12 +197,14 @@ def calibrate_command(
     ] = 50,
     centroids: Annotated[
         str,
-        typer.Option(metavar="{psf,windowed,given}", help="How positions on images are measured."),
+        typer.Option(
+            **one_of("psf", "windowed", "given"), help="How positions on images are measured."
+        ),
     ] = "psf",
     reference_point: Annotated[
         str,
         typer.Option(
-            metavar="{header,center,nearest-source}",
+            **one_of("header", "center", "nearest-source"),
             help="Tangent point and origin of the polynomial; the center if off the detector.",
         ),
     ] = "header",

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.completion import one_of
 from wpdc_gwcs.cli.files import CalibrationFile, read_one
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free
 from wpdc_gwcs.counts import counted
@@ -39,7 +40,7 @@ def export_command(
         str | None,
         typer.Option(
             "--format",
-            metavar="{fits,cpdis,tpv,head,sip,tab,stock}",
+            **one_of("fits", "cpdis", "tpv", "head", "sip", "tab", "stock"),
             help="fits: TPV and table, exact for wpdc; cpdis: for astropy.wcs; tpv, head: TPV "
             "fitted to everything, for SWarp, SCAMP, GalSim (FITS or text); sip: for DS9; tab: for "
             "wcslib; stock: gwcs alone. Default with --into: tpv.",
@@ -59,7 +60,9 @@ def export_command(
     degree: Degree = None,
     alternates: Annotated[
         str,
-        typer.Option(metavar="{keep,remove}", help="With --into: keep or remove alternate WCSs."),
+        typer.Option(
+            **one_of("keep", "remove"), help="With --into: keep or remove alternate WCSs."
+        ),
     ] = "keep",
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
@@ -180,7 +183,7 @@ def convert_command(
     to: Annotated[
         str,
         typer.Option(
-            metavar="{asdf,fits,cpdis,tpv,head,sip,tab,stock}",
+            **one_of("asdf", "fits", "cpdis", "tpv", "head", "sip", "tab", "stock"),
             help="asdf: as wpdc calibrate writes it; the others: as for wpdc export.",
         ),
     ],

@@ -7,6 +7,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.completion import one_of
 from wpdc_gwcs.cli.options import Overwrite
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
@@ -17,7 +18,7 @@ CalibrationFile = Annotated[
 ]
 Origin = Annotated[
     int,
-    typer.Option(metavar="{0,1}", help="Pixel coordinate of the center of the first pixel."),
+    typer.Option(**one_of("0", "1"), help="Pixel coordinate of the center of the first pixel."),
 ]
 Output = Annotated[
     Path | None,

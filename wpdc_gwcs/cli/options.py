@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from wpdc_gwcs.cli.app import set_verbosity
+from wpdc_gwcs.cli.completion import complete, one_of
 from wpdc_gwcs.exceptions import InputError
 from wpdc_gwcs.extras import PLOT, require
 
@@ -126,6 +127,7 @@ Preset = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
+        autocompletion=complete(*preset_names()),
         help=f"Options for a known camera: {', '.join(preset_names())}.",
         callback=_load_preset,
         is_eager=True,
@@ -173,7 +175,7 @@ PixelScale = Annotated[
 Origin = Annotated[
     int | None,
     typer.Option(
-        metavar="{0,1}",
+        **one_of("0", "1"),
         help="Number of the first pixel in tables of sources; default: from the table, else 0.",
     ),
 ]

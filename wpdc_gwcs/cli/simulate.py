@@ -7,6 +7,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.completion import complete, one_of
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, read_numbers
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.exceptions import InputError
@@ -28,6 +29,7 @@ def simulate_command(
         str,
         typer.Option(
             metavar="NAME",
+            autocompletion=complete("generic", "csst-msc", "bass-90prime"),
             help="Camera: generic (one detector), csst-msc (18 detectors of 9216 x 9232 px) or "
             "bass-90prime (four chips around a common reference point).",
         ),
@@ -63,7 +65,7 @@ def simulate_command(
         ),
     ] = None,
     sources: Annotated[
-        str, typer.Option(metavar="{ldac,ecsv}", help="Form of the lists.")
+        str, typer.Option(**one_of("ldac", "ecsv"), help="Form of the lists.")
     ] = "ldac",
     size: Annotated[
         str | None,

@@ -8,6 +8,7 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.calibrate import Catalog, WcsFile
+from wpdc_gwcs.cli.completion import one_of
 from wpdc_gwcs.cli.options import (
     Blind,
     Cache,
@@ -71,7 +72,7 @@ def detect_command(
     frame: Annotated[str, typer.Argument(metavar="IMAGE", help="FITS image, path or path[EXT].")],
     output: Table,
     centroids: Annotated[
-        str, typer.Option(metavar="{psf,windowed}", help="How positions are measured.")
+        str, typer.Option(**one_of("psf", "windowed"), help="How positions are measured.")
     ] = "psf",
     threshold: Threshold = 5.0,
     min_snr: MinSNR = 10.0,
