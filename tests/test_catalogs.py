@@ -663,7 +663,7 @@ def test_motion_is_that_of_the_near():
     assert np.flatnonzero(catalog["pm_from_neighbors"]).tolist() == [3, 20, 50]
 
 
-def test_a_star_moves_alike_in_every_part_of_the_catalogue():
+def test_a_star_moves_alike_in_every_part_of_the_catalog():
     table, _, lacking = moving_field(n=500)
     whole = fill_motions(read_catalog(table))
     part = select_cone(whole, 0.0, 40.0, 0.05)

@@ -397,7 +397,7 @@ def test_evaluate_compares_the_weights(results, tmp_path, capsys):
     assert "uniform" not in capsys.readouterr().out
 
 
-def test_matches_have_the_magnitudes_of_the_catalogue(inputs, results):
+def test_matches_have_the_magnitudes_of_the_catalog(inputs, results):
     catalog = Table.read(inputs[1])
     for path in sorted(results.glob("*.matches.ecsv")):
         matches = Table.read(path)

@@ -369,7 +369,7 @@ def test_refuses_a_handful_of_reference_stars(n):
         run(field)
 
 
-def test_refuses_a_catalogue_of_another_part_of_the_sky():
+def test_refuses_a_catalog_of_another_part_of_the_sky():
     field = make_field(22)
     field["xr"] = field["xr"] + 1e5
     with pytest.raises(MatchError, match=r"too few reference stars in reach of the frame.*: 0"):
@@ -451,7 +451,7 @@ def make_copies(rng, *, angle=0.0, share=1.0):
 
 @pytest.mark.parametrize("angle", [0.0, 1.0])
 @pytest.mark.parametrize("first", [True, False])
-def test_refuses_a_catalogue_that_has_the_field_twice(rng, angle, first):
+def test_refuses_a_catalog_that_has_the_field_twice(rng, angle, first):
     stars, original = make_copies(rng, angle=angle)
     field = make_repeating(stars, original == first, rng)
     with pytest.raises(MatchError, match=r"ambiguous: \d+ pairs .* and \d+ pairs .* px apart"):
@@ -621,7 +621,7 @@ def test_sources_takes_low_level_and_generalized_wcs():
     assert same_pairs(matches, match_sources(sources, catalog, general)[0])
 
 
-def test_sources_moves_the_catalogue_to_the_epoch(rng):
+def test_sources_moves_the_catalog_to_the_epoch(rng):
     field, wcs, sources, catalog = make_tables()
     n = len(catalog)
     pmra, pmdec = rng.normal(size=(2, n)) * 200

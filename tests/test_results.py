@@ -122,7 +122,7 @@ def test_tables_of_another_run_are_not_evaluated(frames, inputs, tmp_path, capsy
     assert "must be of the same run as" in capsys.readouterr().err
 
 
-def test_one_frame_takes_any_catalogue(frames, inputs):
+def test_one_frame_takes_any_catalog(frames, inputs):
     matched = [match_frame(frames[0], c) for c in (inputs[1], Table.read(inputs[1]))]
     np.testing.assert_array_equal(*(m.reference["catalog_index"] for m in matched))
 
@@ -340,7 +340,7 @@ def test_executors(frames, inputs, kind):
         np.testing.assert_array_equal(a.matches["catalog_index"], b.matches["catalog_index"])
 
 
-def test_a_frame_is_handed_only_its_part_of_the_catalogue(frames, inputs):
+def test_a_frame_is_handed_only_its_part_of_the_catalog(frames, inputs):
     whole = Table.read(inputs[1])
     far = whole.copy()
     far["dec"] = -far["dec"]
