@@ -128,7 +128,7 @@ def draw_degrees():
         print(f"{n} stars: {np.round(sizes, 3)}")
     axes.set_yscale("log")
     axes.set_ylim(1e-3, 30)
-    axes.annotate("there is none\nof degree 7", (7, 1.1e-3), (5.7, 5e-3), color=GRAY, fontsize=9,
+    axes.annotate("no terms of\ndegree 7", (7, 1.1e-3), (5.1, 2.2e-3), color=GRAY, fontsize=9,
                   arrowprops={"arrowstyle": "->", "color": GRAY})  # fmt: skip
     axes.set_xlabel("degree of the polynomial")
     axes.set_ylabel("standard deviation of a coefficient [px]")
