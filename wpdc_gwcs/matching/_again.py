@@ -1,4 +1,4 @@
-"""Pairs made anew once they are known: where their neighbors say, for positions that moved."""
+"""New pairs from known ones, for positions that have changed."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,14 +11,14 @@ from wpdc_gwcs.robust import plane_scatter
 
 __all__ = ["pair_again"]
 
-# Radius in units of the scatter of pairs left out, and the least one, px: those of a first match.
+# Radius in units of the scatter of left-out pairs, and its minimum, px: as in a first match.
 _RADIUS, _LEAST_RADIUS = 5.5, 0.05
-# Pairs have been judged already: only what no distortion explains is clipped.
+# The pairs have been judged before: clip only what no distortion explains.
 _LOOSE_CLIP = 50.0
 
 
 def pair_again(xs, ys, xr, yr, i_src, i_ref, *, image_shape):
-    """Pair two lists anew, each source where pairs that were found before say that its star is.
+    """Pair two lists again, with the positions that the known pairs predict.
 
     Parameters
     ----------
@@ -34,8 +34,8 @@ def pair_again(xs, ys, xr, yr, i_src, i_ref, *, image_shape):
     Returns
     -------
     i_src, i_ref : (n,) ndarray of int
-        Rows of the new pairs, in order of the source row; the old ones where they are too few to
-        say anything.
+        Rows of the new pairs, in order of the source row; the old ones if they are too few for a
+        prediction.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def pair_again(xs, ys, xr, yr, i_src, i_ref, *, image_shape):
 
     Notes
     -----
-    A smooth mapping is fitted to the pairs, and a moving local plane to what it leaves; each source
+    A smooth mapping is fitted to the pairs, and a moving local plane to the residuals; each source
     is paired within 5.5 times the robust scatter of pairs left out, if there is exactly one star
     and that star has no other source.
 

@@ -24,11 +24,11 @@ from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["match_planes"]
 
-# Radius about a mapping that the caller gives, px.
+# Search radius about a given mapping, px.
 _START_RADIUS = 20.0
-# Starts that may end well but for a part of the frame.
+# Maximum number of starts that match except in a part of the frame.
 _MOST_PARTIAL = 3
-# Groups with this share of the support of one that has led to a match are followed too.
+# Groups with at least this fraction of the support of a successful group are followed, too.
 _RIVAL_SUPPORT = 0.3
 
 
@@ -69,7 +69,7 @@ def match_planes(
         A mapping to begin with (``mapping`` of earlier diagnostics) in place of the search by
         patterns.
     **options
-        Choices of `MatchOptions`: how far is searched, what evidence is needed.
+        Fields of `MatchOptions`: the range of the search, the evidence needed.
 
     Returns
     -------
@@ -147,7 +147,7 @@ def match_planes(
 
 
 def _match_from_start(problem, start, clock):
-    """Begin with a mapping that is known to be nearly right."""
+    """Match from a mapping that is known to be nearly right."""
     part = sample_rows(len(problem.sources))
     mapped = np.column_stack(start(*problem.sources[part].T))
     radius = np.minimum(problem.limit[part], _START_RADIUS)
@@ -161,7 +161,7 @@ def _match_from_start(problem, start, clock):
 
 
 def _search(problem, clock):
-    """Look stars up by their neighborhoods until a group of them leads to a match."""
+    """Search patterns of neighbors until a group of hypotheses leads to a match."""
     attempts, seen = Attempts(), frozenset()
     for seeds in find_seeds(problem):
         clock.lap("patterns")
@@ -216,7 +216,7 @@ def _try_pairs(problem, seed, first, attempts, seen, clock):
 
 
 class _Clock:
-    """Seconds by stage; a stage that comes back adds up."""
+    """Seconds by stage; repeated stages add up."""
 
     def __init__(self):
         self.laps = {}

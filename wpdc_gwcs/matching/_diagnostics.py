@@ -19,9 +19,9 @@ class MatchDiagnostics:
     n_pairs : int
         Number of pairs.
     expected_by_chance : float
-        Pairs that chance alone gives at the final radius, counted at shifted positions.
+        Pairs expected by chance at the final radius, counted at shifted positions.
     purity : float
-        Estimated share of right pairs.
+        Estimated fraction of correct pairs.
     completeness : float
         Pairs per star of the list that has fewer on the frame.
     significance : float
@@ -41,7 +41,7 @@ class MatchDiagnostics:
     rotation, scale : float
         Rotation in deg and scale of the header at the center of the frame, from `mapping`.
     parity : int
-        -1 where the frame was found mirrored, else 1.
+        -1 if the frame is mirrored, else 1.
     areas : tuple of AreaEvidence
         Evidence in the parts of the frame.
     timings : dict

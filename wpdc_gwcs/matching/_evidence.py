@@ -20,28 +20,28 @@ __all__ = [
     "poisson_significance",
 ]
 
-# Sources looked at for the chance level, and shifts tried.
+# Maximum number of sources for the chance level, and number of shifts.
 _SAMPLE = 10_000
 _N_SHIFTS = 10
-# Pairs that a circle should hold, and those it must lead one to expect at least to be judged.
+# Pairs that a circle should contain, and minimum number expected for it to be judged.
 _PER_AREA = 16.0
 _JUDGED = 8.0
 _MOST_AREAS = 16
-# Chance that a right match is refused for the counts of any of its parts: of many parts some have
-# few pairs.  Parts are compared with this share of the pairs that the better ones promise, and are
-# good in any case with that share of them.
+# Probability that a correct match is refused because of the counts in any part: some of many parts
+# have few pairs.  Parts are compared with the first fraction of the pairs that the better parts
+# suggest, and are always good with the second one.
 _PARTS_CHANCE = 0.01
 _PROMISED, _PLENTY = 0.8, 0.4
-# Pairs by chance in a part at least: none seen does not mean that none could be.
+# Minimum number of pairs by chance in a part, even if none was seen.
 _LEAST_BY_CHANCE = 1e-3
-# Stars counted in circles: more would not sharpen the verdict.
+# Maximum number of stars counted in circles: more would not improve the verdict.
 _COUNTED = 60_000
 # Share of the significance that is needed where all that the search could choose from is counted:
 # 9 sigma (3e-18) leave twelve orders of magnitude for the hypotheses of a search, 5.2 sigma (1e-6)
 # are what is left.  As all ways are counted as if each led to another match it is an upper limit:
 # of 1500 random fields, in clusters and in rows too, none reached more than 0 sigma.
 _SEARCH_SHARE = 0.58
-# Ways to read the axes of the frame that a blind search tries.
+# Number of orientations of the axes that a blind search tries.
 _ORIENTATIONS = 8
 # Leave-one-out residuals of pairs on which the mapping hangs are not looked at more closely, nor
 # shares of the radius at which positions are not independent.
@@ -49,11 +49,11 @@ _MOST_LEVERAGE = 0.99
 _LEAST_SHARE = 1e-3
 # Parts of the sources, those with the smallest radii, of which the one that says most is taken.
 _WIDEST = (0.5, 0.7, 0.85, 1.0)
-# Neighbor that tells the local density of reference stars.
+# The distance to this neighbor gives the local density of reference stars.
 _DENSITY_NEIGHBOR = 6
-# Reference stars within reach of a source at least: none found does not mean that none could be.
+# Minimum number of reference stars within reach of a source, even if none was found.
 _LEAST_REACHED = 0.5
-# Pairs without which the order of their brightness is not looked at, and the most that are.
+# Minimum number of pairs for a test of the order of brightness, and maximum number used.
 _ORDER_PAIRS = (5, 100)
 
 
@@ -71,9 +71,9 @@ class AreaEvidence:
         Pairs expected from the stars of both lists, if the area were like the better parts of the
         frame.
     expected_by_chance : float
-        Pairs that chance gives.
+        Pairs expected by chance.
     judged : bool
-        Whether there are enough stars to say anything.
+        Whether there are enough stars for a judgment.
     accepted : bool
         Whether the pairs exceed chance and are not far fewer than expected; true where not judged.
     """
@@ -92,9 +92,9 @@ class AreaEvidence:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Numbers on which a match is accepted or refused.
+    """Numbers by which a match is accepted or refused.
 
-    `search_significance` is that of `judge_few`, NaN where there are many stars.
+    `search_significance` is that of `judge_few`, NaN for many stars.
     """
 
     n_pairs: int
@@ -108,7 +108,7 @@ class Evidence:
     search_significance: float = np.nan
 
     def is_significant(self, min_significance):
-        """Whether the pairs are beyond chance, by the count or by what the search could choose."""
+        """Whether the pairs exceed chance, by counts or by the number of possible mappings."""
         return (
             self.significance >= min_significance
             or self.search_significance >= _SEARCH_SHARE * min_significance
@@ -147,7 +147,7 @@ class Evidence:
 
 
 def poisson_significance(count, expected):
-    """Express the chance to see at least `count` where `expected` are expected as sigmas.
+    """Return the probability of at least `count` events with mean `expected`, in sigmas.
 
     Notes
     -----
@@ -169,7 +169,7 @@ def _log_poisson_tail(count, expected):
 def judge_few(
     points, mapped, radius, leverage, stars, terms, pairs, shape, *, reaches, brightness=None
 ):
-    r"""Significance of the pairs of a short list against all mappings that could have been found.
+    r"""Return the significance of a short list against all mappings that could be found.
 
     With a few stars the chance level cannot be counted: at no shift there is a pair, and whether
     one in ten shifts or in a thousand is to be expected makes all the difference.  Here it follows
@@ -311,7 +311,7 @@ def log_chance_of_order(one, other):
 
 
 def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shape, *, slack=1.0):
-    """Measure what a set of pairs is worth.
+    """Collect the evidence for a set of pairs.
 
     Parameters
     ----------
@@ -322,13 +322,13 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
     stars : Stars
         The reference stars.
     mapping : SmoothMap
-        The mapping, which also costs degrees of freedom.
+        The mapping, which takes degrees of freedom.
     pairs : (i_src, i_ref)
         The pairs.
     image_shape : (int, int)
         Shape of the frame.
     slack : float
-        As it was used to find the pairs, see `find_edges`.
+        As used to find the pairs, see `find_edges`.
 
     Returns
     -------
@@ -337,11 +337,9 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
     Notes
     -----
     The chance level is counted, not modeled: the mapped sources are shifted against the reference
-    by vectors
-    far longer than the radius (but short against the scale on which the density changes) and
-    paired again.
-    Each term of the mapping can bring one pair into line, so the significance counts the pairs
-    less the terms.
+    by vectors far longer than the radius (but short against the scale on which the density changes)
+    and paired again. Each term of the mapping can bring one pair into line, so the significance
+    counts the pairs less the terms.
     """
     ny, nx = image_shape
     i_src, i_ref = pairs
@@ -401,7 +399,7 @@ def _count_by_chance(mapped, radius, stars, slack):
 
 
 def _judge_areas(sources, reference, pairs, chance, weight, image_shape):
-    """Evidence in circles about the nodes of a grid over the frame, wide enough to hold pairs."""
+    """Evidence in circles around grid nodes over the frame, large enough to contain pairs."""
     ny, nx = image_shape
     step = max(1, len(sources) // _COUNTED)
     lists = [p[::step] for p in (sources, reference, pairs)]
@@ -419,19 +417,19 @@ def _judge_areas(sources, reference, pairs, chance, weight, image_shape):
     if len(chance):
         by_chance = cKDTree(chance).query_ball_point(nodes, radius, return_length=True)
         by_chance = by_chance * weight / step
-    # the better parts of the frame say what to expect: an average would be pulled down by the bad
+    # expect what the better parts have: an average would include the bad ones
     shares = [
         np.quantile(n_pairs[n > 0] / n[n > 0], 0.75) if n.any() else 0.0
         for n in (n_sources, n_reference)
     ]
     expected = np.minimum(shares[0] * n_sources, shares[1] * n_reference)
-    # so many that none found would be too rare for one of so many parts
+    # enough that zero pairs would be too improbable for any of so many parts
     n_parts = np.count_nonzero(expected >= _JUDGED)
     needed = max(_JUDGED, np.log(max(n_parts, 1) / _PARTS_CHANCE) / _PROMISED)
     judged = expected >= needed
     too_few = pdtr(n_pairs, _PROMISED * expected)
     enough = (too_few > _PARTS_CHANCE / max(n_parts, 1)) | (n_pairs > _PLENTY * expected)
-    # chance must explain the pairs less well than a match does, which may have lost some
+    # chance must explain the pairs less well than a match with some losses
     floor = max(0.5 * weight / step, _LEAST_BY_CHANCE)
     too_many = pdtrc(n_pairs - 1.0, np.maximum(by_chance, floor))
     too_many = np.where(n_pairs > 0, too_many, 1.0)

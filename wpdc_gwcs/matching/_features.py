@@ -1,10 +1,9 @@
-"""Neighbor patterns: who is who, from relative positions alone.
+"""Neighbor patterns: identification of stars from relative positions alone.
 
-Around every star its neighbors are noted as ``(log d, theta)``.  A common rotation and scale of
-the neighborhood
-is a common shift in that plane, so two stars are compared by looking for the shift at which most
-of their
-neighbors coincide; how many coincide by chance follows from how many differences there are.
+Around every star its neighbors are noted as ``(log d, theta)``.  A common rotation and scale of the
+neighborhood is a common shift in that plane, so two stars are compared by looking for the shift at
+which most of their neighbors coincide; how many coincide by chance follows from how many
+differences there are.
 """
 
 from dataclasses import dataclass
@@ -26,11 +25,11 @@ __all__ = [
 # Widths of the coincidence box in (log d, theta): from fine to coarse, the data pick (adaptive
 # threshold).
 BOX_WIDTHS = (0.02, 0.04, 0.08)
-# An agreement this surprising (decimal logarithm) makes a hypothesis member of a group.
+# Decimal logarithm of the improbability at which an agreement puts a hypothesis into a group.
 _LEAST_WORTH = 1.0
-# Anchors that are looked at whatever they cost.
+# Number of anchors that are compared at any cost.
 _LEAST_ANCHORS = 8
-# Neighbors that must coincide for a hypothesis.
+# Minimum number of coinciding neighbors for a hypothesis.
 _LEAST_COUNT = 3
 # Differences held in memory at a time.
 _CHUNK = 2_000_000
@@ -41,7 +40,7 @@ MAX_NEIGHBOURS = 160
 
 
 def density_ratio_map(xs, ys, xr, yr, image_shape, *, per_cell=40.0):
-    """Local ratio of the source density to the reference density, on a grid over the frame.
+    """Return the local ratio of source to reference density, on a grid over the frame.
 
     Parameters
     ----------
@@ -70,7 +69,7 @@ def density_ratio_map(xs, ys, xr, yr, image_shape, *, per_cell=40.0):
 
 
 def neighbor_pattern(tree, rows, n_neighbors):
-    """Neighbors of some stars in polar form.
+    """Return the neighbors of some stars in polar coordinates.
 
     Parameters
     ----------
@@ -79,7 +78,7 @@ def neighbor_pattern(tree, rows, n_neighbors):
     rows : (n,) ndarray of int
         Stars whose neighbors are wanted.
     n_neighbors : int
-        How many.
+        Number of neighbors.
 
     Returns
     -------
@@ -101,7 +100,7 @@ def neighbor_pattern(tree, rows, n_neighbors):
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Candidates "source i is reference star j", with local scale and rotation.
+    """Candidates that source i is reference star j, with local scale and rotation.
 
     Parameters
     ----------
@@ -110,9 +109,9 @@ class Hypotheses:
     log_scale, rotation : (n,) ndarray
         Reference neighborhood relative to the source's, rotation in rad.
     count, expected : (n,) ndarray
-        Neighbors that coincide and how many would by chance.
+        Number of coinciding neighbors, and number expected by chance.
     surprise : (n,) ndarray
-        Minus the decimal logarithm of the probability that a wrong candidate looks so good.
+        Minus the decimal logarithm of the probability that a wrong candidate is as good.
     width : (n,) ndarray
         Width of the coincidence box.
     """
@@ -164,7 +163,7 @@ def compare_patterns(
     max_log_scale, max_rotation : float
         Largest difference of local scale (natural log) and rotation (rad).
     budget : int
-        Most differences of neighbors to look at; the last anchors are left out to keep to it.
+        Maximum number of differences of neighbors; the last anchors are left out to respect it.
     per_anchor : int
         Candidates to keep for every source.
 
@@ -227,7 +226,7 @@ def compare_patterns(
 
 
 def _coincidences(log_s, angle_s, log_r, angle_r, max_log_scale, max_rotation):
-    """Best common shift in (log d, theta) of patterns (P, ks) against (P, kr)."""
+    """Find the best common shift in (log d, theta) of patterns (P, ks) against (P, kr)."""
     n, n_source = log_s.shape
     n_reference = log_r.shape[1]
     # Angles in 1/65536 turns: short integers wrap round by themselves.
@@ -324,12 +323,11 @@ def select_coherent(
     max_seeds=8,
     most=500,
 ):
-    """Find groups of hypotheses that tell one story.
+    """Find groups of consistent hypotheses.
 
-    Two hypotheses agree when the local scale and rotation of one predict where the other one's
-    star is, within
-    the width of its box and what the curvature of the distortion may add over the distance between
-    them.
+    Two hypotheses agree when the local scale and rotation of one predict where the other one's star
+    is, within the width of its box and what the curvature of the distortion may add over the
+    distance between them.
 
     Parameters
     ----------

@@ -99,8 +99,7 @@ class SmoothMap:
         Total degree of the polynomial.
     coefficients : (2, n_terms) ndarray
         Displacement in x and y, in products of Chebyshev polynomials of the normalized coordinates
-        sorted by
-        total degree.
+        sorted by total degree.
     center : (2,) ndarray
         Where the normalized coordinates are zero, px.
     scale : float
@@ -184,8 +183,8 @@ class SmoothMap:
         """Find the starting positions of mapped ones by fixed-point iteration.
 
         The displacement is evaluated no further than 5 % outside the frame, where a polynomial
-        still means
-        something; good to a fraction of a pixel, which is what counting stars in the frame needs.
+        still means something; good to a fraction of a pixel, which is what counting stars in the
+        frame needs.
         """
         x, y = np.asarray(x, float), np.asarray(y, float)
         cx, cy = self.center
@@ -249,11 +248,9 @@ def fit_smooth_map(
 ):
     """Fit a smooth mapping to pairs: order from leave-one-out errors, outliers clipped.
 
-    All orders come from one QR decomposition, since the columns are sorted by degree.  The order
-    is the lowest
-    one whose mean squared leave-one-out error (each clipped, so that wrong pairs do not decide) is
-    within 2 %
-    of the best.
+    All orders come from one QR decomposition, since the columns are sorted by degree.  The order is
+    the lowest one whose mean squared leave-one-out error (each clipped, so that wrong pairs do not
+    decide) is within 2 % of the best.
 
     Parameters
     ----------

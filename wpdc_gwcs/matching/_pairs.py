@@ -27,8 +27,7 @@ def find_edges(points, tree, radius, *, limit=None, slack=1.0):
         Reach of each point; a point with radius <= 0 or NaN looks for nobody.
     limit : (M,) ndarray, optional
         Largest radius that may be used to reach each partner (where partners stand close, a wide
-        radius says
-        nothing).
+        radius says nothing).
 
     slack : float
         A radius larger than the limit of a partner counts as the limit up to this factor; beyond,
@@ -38,8 +37,7 @@ def find_edges(points, tree, radius, *, limit=None, slack=1.0):
     -------
     i, j : (n,) ndarray of int
         Edges: ``i`` is a row of `points`, ``j`` of the tree.  At most three edges per point: two
-        already make it
-        ambiguous.
+        already make it ambiguous.
     distance : (n,) ndarray
         Length of each edge.
     """
@@ -82,10 +80,8 @@ def pair_nearest(xs, ys, xr, yr, radius):
     """Pair two lists of positions one to one within a radius, leaving out what is ambiguous.
 
     A pair is delivered when the source has exactly one reference star within its radius and no
-    other source
-    reaches the same reference star.  Nothing is guessed: where two candidates lie within the
-    radius, on either
-    side, none of them is paired.
+    other source reaches the same reference star.  Nothing is guessed: where two candidates lie
+    within the radius, on either side, none of them is paired.
 
     Parameters
     ----------
