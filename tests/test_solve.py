@@ -600,7 +600,9 @@ class TestRobustness:
         with pytest.raises(FitError, match="no exposure"):
             solve([], image_shape=SHAPE)
         field.exposures = [replace(field.exposures[0], ra=np.zeros(3))]
-        with pytest.raises(ValueError, match="exposure e0: ra has 3 values, x has 50"):
+        with pytest.raises(
+            ValueError, match="exposure e0: ra must have as many values as x, has 3, x has 50"
+        ):
             field.solve()
 
 

@@ -492,6 +492,4 @@ def print_summary(run, folder):
     n = int(np.sum(run.summary["status"] != "failed"))
     degraded = int(np.sum(run.summary["status"] == "degraded"))
     also = f", {degraded} of them degraded" if degraded else ""
-    typer.echo(
-        f"{n} of {counted(len(run.summary), 'frame')} solved{also}; results in {os.fspath(folder)}"
-    )
+    typer.echo(f"{n} of {len(run.summary)} frames solved{also}; results in {os.fspath(folder)}")
