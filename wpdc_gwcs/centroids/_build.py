@@ -1,4 +1,4 @@
-"""The effective PSF of a frame, learnt from its own stars."""
+"""The effective PSF of a frame, learned from its own stars."""
 
 from dataclasses import replace
 
@@ -185,7 +185,7 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
     stars : Stars
         Start values.
     start : Profile
-        Profile to start from, constant or varying; what is learnt is the difference from it,
+        Profile to start from, constant or varying; what is learned is the difference from it,
         the same all over the detector.
     fwhm : float
         FWHM in px.
@@ -315,7 +315,7 @@ def _powers(degree):
 
 
 def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
-    """Spline coefficients that take up what a profile leaves: penalised least squares."""
+    """Spline coefficients that take up what a profile leaves: penalized least squares."""
     stride = 2 if finest >= _HALF_PIXEL_KNOTS else 1
     over, size = profile.oversampling // stride, (profile.coefficients.shape[-1] - 1) // stride + 1
     half = profile.radius - 1
