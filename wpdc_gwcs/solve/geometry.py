@@ -1,4 +1,4 @@
-"""Where detectors stand in the focal plane, and where exposures point.
+"""Positions of detectors in the focal plane, and pointings of exposures.
 
 ::
 
@@ -14,10 +14,10 @@ from wpdc_gwcs.models import deproject, project
 
 __all__ = ["Geometry", "mean_direction", "start_geometry"]
 
-# Sky positions of a frame that stand for its linear WCS, along each axis.
+# Points along each axis that represent the linear WCS of a frame.
 _POINTS = 4
 
-# Step on the tangent plane that tells how it turns, deg.
+# Step on the tangent plane to measure its rotation, deg.
 _STEP = 1e-3
 
 
@@ -100,13 +100,13 @@ class Geometry:
         exposure : int
             Number of the exposure.
         shift : (2,) ndarray
-            Of the focal plane, px.
+            Shift of the focal plane, px.
         matrix : (2, 2) ndarray
-            Of the focal plane.
+            Linear map of the focal plane.
         """
         cd = self.cd[exposure]
         at = cd @ shift
-        # North turns with the pointing, near a pole by as much as one likes.
+        # North rotates with the pointing, near a pole by any angle.
         step = at[:, None] + _STEP * np.array([[0.0, 1.0, -1.0, 0.0, 0.0],
                                                [0.0, 0.0, 0.0, 1.0, -1.0]])  # fmt: skip
         sky = np.array(deproject(*step, self.pointing[exposure]))
@@ -116,17 +116,17 @@ class Geometry:
 
 
 def start_geometry(observations):
-    """Places of all detectors and pointings of all exposures from the linear WCS of the frames.
+    """Derive positions of detectors and pointings of exposures from the WCS of the frames.
 
     Parameters
     ----------
     observations : Observations
-        Its frames bring a CRVAL and a CD each.
+        Observations whose frames have CRVAL and CD.
 
     Returns
     -------
     Geometry
-        Places that agree with the frames' own attitudes.
+        Geometry that agrees with the attitudes of the frames.
     """
     o = observations
     n_detectors, n_exposures = len(o.detectors), o.n_exposures
@@ -150,7 +150,7 @@ def _by_exposure(o, values):
 
 
 def _start_mosaic(o, n_detectors, n_exposures):
-    # The exposure with the most detectors holds the focal plane; others join by what they share.
+    # The exposure with the most detectors defines the focal plane; others join by shared detectors.
     size = np.bincount(o.exposure_of, minlength=n_exposures)
     points = [_points(f, o.detector(k)) for k, f in enumerate(o.frames)]
     place, matrix = np.full((n_detectors, 2), np.nan), np.full((n_detectors, 2, 2), np.nan)
@@ -162,7 +162,7 @@ def _start_mosaic(o, n_detectors, n_exposures):
         shared = {e: int(known[o.detector_of[o.frames_of(e)]].sum()) for e in todo}
         e = max(todo, key=lambda e: (shared[e], size[e]))
         if not shared[e]:
-            # Nothing in common with what is known: a focal plane of its own about the same origin.
+            # Not connected to the others: a separate focal plane about the same origin.
             e = first if first in todo else e
             frames = o.frames_of(e)
             centers = np.array([points[k][1][:, 0] for k in frames])
@@ -213,7 +213,7 @@ def mean_direction(sky):
 
 
 def _first_matrix(frame, pointing):
-    """CD of the first frame as it is on the tangent plane about another point."""
+    """CD of the first frame on the tangent plane about another point."""
     cd, crval = np.asarray(frame.cd, float), np.asarray(frame.crval, float)
     step = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     plane = np.array(project(*deproject(*(cd @ step), crval), pointing))

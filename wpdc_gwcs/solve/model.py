@@ -1,4 +1,4 @@
-"""The model of a camera as it stands: geometry, coefficients, tables, fields."""
+"""The current model of a camera: geometry, coefficients, tables, fields."""
 
 from dataclasses import dataclass, field, replace
 
@@ -12,7 +12,7 @@ __all__ = ["Model", "design", "focal_variance", "residuals", "undistorted"]
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Everything that takes a pixel of a frame to the sky.
+    """The mapping from pixels of frames to the sky.
 
     Parameters
     ----------
@@ -21,18 +21,18 @@ class Model:
     terms : tuple of Term
         Displacements of the focal plane.
     coefficients : dict
-        Name of a term to its coefficients, ``(K,)`` (camera) or ``(n, K)`` (each detector or
-        exposure).
+        Coefficients of the terms by name, ``(K,)`` (camera) or ``(n, K)`` (detectors or
+        exposures).
     sigma : dict
-        Name of a term to the standard deviations of its groups, px.
+        Standard deviations of the groups of the terms by name, px.
     tables : tuple
         For each detector a function of its pixels that returns displacements to subtract, or
         `None`.
     fields : dict
-        Frame to its `Field`; no entry for none.
+        The `Field` of each frame that has one.
     statics : dict
-        Detector to the `Field` that all its exposures share, as a function of the place on the
-        focal plane without distortion: it belongs to the pixels; no entry for none.
+        The `Field` of each detector that all its exposures share, as a function of the position in
+        the focal plane without distortion, because it belongs to the pixels.
     """
 
     geometry: Geometry
@@ -46,7 +46,7 @@ class Model:
     _at_stars: dict = field(default_factory=dict, repr=False)
 
     def changed(self, **parts):
-        """Model with other parts than its fields; what was computed with them is forgotten.
+        """Return the model with new parts except fields, without cached values.
 
         Parameters
         ----------
@@ -56,27 +56,27 @@ class Model:
         Returns
         -------
         Model
-            With these.
+            The new model.
         """
         return replace(self, _without_fields={}, _at_stars={}, **parts)
 
     def with_fields(self, fields):
-        """Model with other fields.
+        """Return the model with other fields.
 
         Parameters
         ----------
         fields : dict
-            Frame to its `Field`.
+            The `Field` of each frame.
 
         Returns
         -------
         Model
-            With these.
+            The new model.
         """
         return replace(self, fields=fields, _at_stars={})
 
     def scoped(self, *scopes):
-        """Terms of some scopes.
+        """Return the terms of some scopes.
 
         Parameters
         ----------
@@ -87,7 +87,7 @@ class Model:
 
 
 def block(model, k, detector, x, y, color=None):
-    """Coordinates of pixels of detector number ``k`` for the designs; also their focal plane.
+    """Return the coordinates of pixels of detector ``k`` for designs, and in the focal plane.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def block(model, k, detector, x, y, color=None):
 
 
 def undistorted(model, k, detector, x, y):
-    """Focal plane position of pixels, distortion and table applied, at the reference color.
+    """Return undistorted positions of pixels in the focal plane, at the reference color.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def undistorted(model, k, detector, x, y):
 
 
 def colored(model, exposure, b):
-    """Displacement of stars that differ from the reference color.
+    """Return the displacement of stars due to their color.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def colored(model, exposure, b):
 
 
 def residuals(model, observations, frame, *, with_field=True):
-    """Model less reference of the pairs of one frame, and their focal plane positions.
+    """Return model minus reference of the pairs of a frame, and their focal plane positions.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def _residuals(model, o, frame):
     s = o.slices[frame]
     k, e = o.detector_of[frame], o.exposure_of[frame]
     detector = o.detectors[k]
-    # Pairs off the detector get no residual; they must not make NaN of others on the way.
+    # Pairs outside the detector get no residual, and must not turn others into NaN.
     finite = o.finite[s]
     x = np.where(finite, o.x[s], detector.center[0])
     y = np.where(finite, o.y[s], detector.center[1])
@@ -210,14 +210,14 @@ def _residuals(model, o, frame):
 
 
 def design(model, observations, frame, x, y, color=None):
-    """Columns of all unknowns at pixels of a frame: shared terms first, then the exposure's.
+    """Return the columns of all unknowns at pixels: shared terms, then those of the exposure.
 
     Parameters
     ----------
     model : Model
         The model.
     observations : Observations
-        For the frame's detector.
+        Observations with the detector of the frame.
     frame : int
         Number of the frame.
     x, y : (N,) ndarray
@@ -237,12 +237,12 @@ def design(model, observations, frame, x, y, color=None):
 
 
 def focal_variance(model, observations, frame, sigma):
-    """Variances of pairs along the axes of the focal plane, ``(2, N)``.
+    """Return variances of pairs along the axes of the focal plane, ``(2, N)``.
 
     Parameters
     ----------
     model : Model
-        For the orientation of the detector.
+        Model with the orientation of the detector.
     observations : Observations
         Pairs.
     frame : int

@@ -1,4 +1,4 @@
-"""Normal equations: accumulated frame by frame, solved by eliminating what is local.
+"""Normal equations: accumulated by frame, solved by elimination of local unknowns.
 
 ::
 
@@ -35,11 +35,11 @@ class Blocks:
     camera, detectors, exposures : (C, C), (D, P, P) and (E, K, K) ndarray
         Diagonal blocks.
     camera_detectors, camera_exposures : (D, C, P) and (E, C, K) ndarray
-        Of the camera's unknowns with those of each detector and exposure.
+        Blocks of the camera with each detector and with each exposure.
     frames : dict
-        (detector, exposure) to the block ``(P, K)`` of their unknowns.
+        Block ``(P, K)`` of each (detector, exposure).
     right : tuple of ndarray
-        ``(C,)``, ``(D, P)`` and ``(E, K)``.
+        Right-hand sides ``(C,)``, ``(D, P)`` and ``(E, K)``.
     """
 
     camera: np.ndarray
@@ -86,12 +86,12 @@ def frame_equations(design, residual, weight, *, field=None):
 
 
 def invert(matrix):
-    """Inverse of a symmetric positive definite matrix.
+    """Invert a symmetric positive definite matrix.
 
     Parameters
     ----------
     matrix : ndarray
-        Of the focal plane, or what is inverted.
+        Matrix to invert.
     """
     root = _inverse_root(matrix)
     return root.T @ root
@@ -102,14 +102,14 @@ def _inverse_root(matrix):
     if not matrix.size:
         return np.zeros_like(matrix)
     diagonal = np.diagonal(matrix)
-    # Elimination may leave nothing but rounding of what is not determined.
+    # After elimination, undetermined unknowns may have only rounding errors.
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-15 * diagonal.max()))
     scaled = matrix * scale[:, None] * scale
     factor, info = lapack.dpotrf(scaled, lower=1, clean=1)
     if info == 0:
         root, info = lapack.dtrtri(factor, lower=1)
     if info != 0:
-        # Singular to rounding: what is not determined keeps what little the prior says.
+        # Numerically singular: undetermined unknowns keep their prior.
         values, vectors = np.linalg.eigh(scaled)
         values = np.maximum(values, values[-1] * 1e-15)
         root = (vectors / np.sqrt(values)).T
@@ -125,9 +125,9 @@ def accumulate(products, sizes, counts):
         Detector, exposure, normal matrix and right-hand side of each frame; its unknowns are those
         of the camera, of the detector and of the exposure, in that order.
     sizes : (int, int, int)
-        Unknowns of the camera, of a detector, of an exposure.
+        Numbers of unknowns of the camera, of a detector, of an exposure.
     counts : (int, int)
-        Detectors and exposures.
+        Numbers of detectors and exposures.
 
     Returns
     -------
@@ -177,17 +177,17 @@ class Posterior:
     _local_detectors: bool
 
     def joint(self, detector, exposure):
-        """Covariance of the unknowns of camera, one detector and one exposure.
+        """Return the covariance of the unknowns of the camera, a detector and an exposure.
 
         Parameters
         ----------
         detector, exposure : int
-            Which.
+            Their numbers.
 
         Returns
         -------
         (C + P + K, C + P + K) ndarray
-            In that order.
+            Covariance in this order.
         """
         c, p, k = len(self.camera), self.detectors.shape[1], self.exposures.shape[1]
         if self._local_detectors:
@@ -232,7 +232,7 @@ def posterior(blocks, camera, detectors, exposures, pulls):
     exposures : (E, K, K) ndarray
         Prior inverse covariances.
     pulls : tuple of ndarray
-        What the priors add to the right-hand sides.
+        Contributions of the priors to the right-hand sides.
 
     Returns
     -------
@@ -243,7 +243,7 @@ def posterior(blocks, camera, detectors, exposures, pulls):
     c, (d, p), (e, k) = len(right[0]), right[1].shape, right[2].shape
     own_detectors = blocks.detectors + detectors[:, :, None] * np.eye(p)
     own_exposures = blocks.exposures + exposures
-    # One detector's polynomial may be all but free where its stars are few: it stays to the last.
+    # The polynomial of a detector with few stars may be almost free: it is not eliminated.
     local_detectors = d > 1 and d * p > e * k
     if local_detectors:
         local, rest, n, m = own_detectors, own_exposures, d, e

@@ -54,7 +54,7 @@ class Detector:
         return 2 * (x - self.center[0]) / nx, 2 * (y - self.center[1]) / ny
 
     def contains(self, x, y):
-        """Return which pixels are on the detector; NaN is not.
+        """Mark pixels on the detector; NaN is not.
 
         Parameters
         ----------
@@ -87,9 +87,9 @@ class Observations:
     Parameters
     ----------
     frames : tuple of Exposure
-        What was given.
+        The given exposures.
     detectors : tuple of Detector
-        In the order of their first frame.
+        Detectors in the order of their first frame.
     slices : tuple of slice
         Rows of each frame.
     detector_of, exposure_of : (F,) ndarray of int
@@ -99,15 +99,15 @@ class Observations:
     sigma : (2, N) ndarray
         Stated errors in px; 1 where there are none.
     reference : (N,) ndarray
-        Share of the reference stars in the variances, 0 to 1.
+        Fraction of the variances due to reference stars, 0 to 1.
     star : (N,) ndarray of int
         Number of the star; -1 where it is unknown.
     has_errors, valid, finite : (N,) ndarray of bool
-        Errors were stated; the pair may be fitted; it gets a residual.
+        Whether errors were stated, the pair may be fitted, and it gets a residual.
     color : (N,) ndarray
         Color of the star minus the reference color, 0 where unknown.
     reference_color : float
-        Median color; NaN where there are no colors.
+        Median color; NaN without colors.
     """
 
     frames: tuple
@@ -158,7 +158,7 @@ class Observations:
 
 
 def gather(frames, shapes, crpix):
-    """Put the pairs of all frames into flat columns, and check them.
+    """Collect the pairs of all frames in flat columns, and check them.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def gather(frames, shapes, crpix):
     sigma = np.where(has_errors & good_error, stated, 1.0)
     share = reference_err**2 / np.mean(sigma**2, axis=0)
     known = np.isfinite(color)
-    # Half of the stars must tell their color before it is worth a term.
+    # Color terms need colors for half of the stars.
     reference_color = float(np.median(color[known & valid])) if _mostly(known, valid) else np.nan
     color = np.where(known & np.isfinite(reference_color), color - reference_color, 0.0)
     return Observations(

@@ -1,4 +1,4 @@
-"""A polynomial of its own for each exposure, the paper's first phase: ``refine="pv"``."""
+"""A separate polynomial for each exposure, as in the first phase of the paper: ``refine="pv"``."""
 
 import logging
 
@@ -12,12 +12,12 @@ __all__ = ["own_polynomial"]
 
 log = logging.getLogger(__name__)
 
-# Stars within the radius of full weight for each coefficient.
+# Stars needed per coefficient within the radius of full weight.
 _STARS_PER_TERM = 3
 
 
 def own_polynomial(o, state, f, solution, parts, residual, weights):
-    """Return a frame a polynomial of its own, the table fixed.
+    """Fit a separate polynomial to a frame, with a fixed table.
 
     Parameters
     ----------
@@ -28,9 +28,9 @@ def own_polynomial(o, state, f, solution, parts, residual, weights):
     f : int
         Number of the frame.
     solution : DistortionSolution
-        Of its detector.
+        Solution of its detector.
     parts : dict
-        Result of the frame with the shared polynomial; it stands where the stars are too few.
+        Result of the frame with the shared polynomial, which is kept if there are too few stars.
     residual : (2, N) ndarray
         Residuals of all pairs; those of the frame are replaced.
     weights : dict
@@ -69,7 +69,7 @@ def own_polynomial(o, state, f, solution, parts, residual, weights):
     )
     covariance = fitter.fit_info["covariance"]
     pv, constant, linear = split_linear(pv)
-    # The table stands behind the polynomial: its own linear part is not touched by the gauge.
+    # The table follows the polynomial, so the gauge does not change its linear part.
     crval = np.array(deproject(*(parts["cd"] @ inverse @ constant), parts["crval"]))
     cd = parts["cd"] @ inverse @ linear @ cd0
     place = inverse @ np.array(pv(*(cd0 @ offset))) - table

@@ -1,4 +1,4 @@
-"""Exposures that are left out: their pairs are wrong, whatever the instrument is."""
+"""Exposures that are left out because of wrong pairs."""
 
 import logging
 from dataclasses import replace
@@ -13,28 +13,28 @@ __all__ = ["without_aliens", "without_wrong"]
 
 log = logging.getLogger(__name__)
 
-# Scatter that no distortion model leaves of right pairs, px.
+# Larger scatter than any model leaves for correct pairs, px.
 _MAX_SCATTER = 2.0
 
-# An exposure whose scatter is this many times that of the others has wrong pairs.
+# An exposure with this many times the scatter of the others has wrong pairs.
 _REJECT_RATIO = 4.0
 
-# Before anything is solved, distortion scatters residuals, but no more than so many times that of
-# the others, and px; frames of fewer pairs than a linear map has terms tell nothing.
+# Before a solution, distortion increases the residuals, but not beyond this ratio to the others and
+# not beyond this many px; frames with fewer pairs than the terms of a linear map are not judged.
 _ALIEN_RATIO, _ALIEN_SCATTER, _LINEAR_TERMS = 10.0, 50.0, 6
 
 
 def without_aliens(o, state):
     """Leave out frames whose pairs no linear map brings near those of the others.
 
-    One of them would draw the polynomial of all toward itself.
+    Such a frame would spoil the polynomial for all.
 
     Parameters
     ----------
     o : Observations
         All stars.
     state : State
-        Nothing is solved yet.
+        State before a solution.
 
     Returns
     -------
@@ -72,14 +72,14 @@ def without_aliens(o, state):
 
 
 def without_wrong(o, state):
-    """Leave out frames whose pairs scatter as only wrong ones do.
+    """Leave out frames with the scatter of wrong pairs.
 
     Parameters
     ----------
     o : Observations
         All stars.
     state : State
-        All terms are solved.
+        State with all terms solved.
 
     Returns
     -------

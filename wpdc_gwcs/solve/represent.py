@@ -1,4 +1,4 @@
-"""What was found, written down in the paper's form: polynomial, table, six numbers, field table."""
+"""Conversion of a solution to the form of the paper: polynomial, tables, six linear numbers."""
 
 from dataclasses import asdict, replace
 
@@ -18,17 +18,17 @@ __all__ = ["N_SIGMA", "inherited", "represent_detector", "represent_frame", "spl
 # Points along each axis: for the fit of the attitude, and for the uncertainty of a frame.
 N_SIGMA = 17
 
-# Nodes of a field's table for the shortest wave of the field.
+# Nodes of the table of a field per shortest wave.
 _NODES_PER_WAVE = 5
 
-# What polynomial, table and attitude leave of a frame's map without being worth a table, px.
+# Deviations of a frame from polynomial, table and attitude that need no table of its own, px.
 _LEAST_FIELD = 1e-4
 
 
 def represent_detector(
     o, state, k, *, weight, degree, n_grid, cd=None, table_sigma=None, factor=1.0
 ):
-    """Polynomial and table of one detector.
+    """Return the polynomial and table of a detector.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def represent_detector(
     k : int
         Number of the detector.
     weight : RadialWeight
-        Weight of the polynomial's fit.
+        Weight for the fit of the polynomial.
     degree : int
         Degree of the PV polynomial.
     n_grid : int
@@ -54,7 +54,7 @@ def represent_detector(
     Returns
     -------
     DistortionSolution
-        Without statistics.
+        Solution without statistics.
     """
     detector = o.detectors[k]
     frame = next((f for f in state.active if o.detector_of[f] == k), None)
@@ -112,7 +112,7 @@ def sigma_grid(covariance, n):
 
 
 def _instrument_sigma(o, state, frame, x, y, table_sigma, factor):
-    """Uncertainty of what the exposures share, without what their attitudes take, on a grid."""
+    """Uncertainty of shared terms without the part that attitudes absorb, on a grid."""
     n = int(np.sqrt(len(x)))
     table = None if table_sigma is None else covariance_of(table_sigma.reshape(3, -1))
     growth = factor * _growth(o, state, int(o.detector_of[frame]), x, y)
@@ -123,14 +123,14 @@ def _instrument_sigma(o, state, frame, x, y, table_sigma, factor):
 
 
 def _growth(o, state, k, x, y):
-    """Factors of the errors of a detector's distortion for the distance to the stars behind it."""
+    """Factors on the errors of the distortion of a detector by the distance to its stars."""
     detector, behind = o.detectors[k], _behind(o, state, k)
     stars = detector.normalized(o.x[behind], o.y[behind])
     return extrapolation(np.array(stars), np.array(detector.normalized(x, y)))
 
 
 def inherited(o, state, k):
-    """Factor of the errors of a detector's distortion for those of stars that exposures share.
+    """Return the factor on the errors of the distortion for stars that exposures share.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def inherited(o, state, k):
 
 
 def _behind(o, state, k):
-    """Mark the pairs that a detector's distortion was learned from."""
+    """Mark the pairs that determine the distortion of a detector."""
     behind = np.zeros(len(o), bool)
     for f in state.active:
         if o.detector_of[f] == k:
@@ -156,7 +156,7 @@ def _behind(o, state, k):
 
 
 def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places, factor=1.0):
-    """Attitude, field and uncertainty of one frame on top of its detector's solution.
+    """Return attitude, field and uncertainty of a frame, given the solution of its detector.
 
     Parameters
     ----------
@@ -167,15 +167,15 @@ def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places, facto
     f : int
         Number of the frame.
     solution : DistortionSolution
-        Of its detector.
+        Solution of its detector.
     n_grid : int
-        Largest number of nodes of the field's table along each axis; 0 for no table: what is left
-        is then part of the uncertainty.
+        Maximum number of nodes of the field table along each axis; 0 for no table, so that the
+        remaining field is part of the uncertainty.
     table_sigma : (3, n, n) ndarray or None
         Uncertainty of the smoothed table, or of a stored solution.
     places : dict
-        Undistorted positions of grids, and what is known of the distance to the stars, which all
-        frames of a detector have in common.
+        Undistorted positions of grids, and factors by the distance to the stars, which all frames
+        of a detector share.
     factor : float, optional
         As from `inherited`.
 
@@ -229,7 +229,7 @@ def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places, facto
 
 
 def delivered_residual(o, f, solution, parts):
-    """Residuals ``(2, N)`` of the pairs of a frame in its delivered WCS, px.
+    """Return residuals ``(2, N)`` of the pairs of a frame in its delivered WCS, px.
 
     Parameters
     ----------
@@ -282,14 +282,14 @@ def _color_shift(o, state, f):
 
 
 def frame_fit(o, state, f, residual, parts):
-    """Put together the result of one frame.
+    """Build the result of a frame.
 
     Parameters
     ----------
     o : Observations
         Pairs.
     state : State
-        Where the solution stands.
+        Current state.
     f : int
         Number of the frame.
     residual : (2, N) ndarray
@@ -326,7 +326,7 @@ def frame_fit(o, state, f, residual, parts):
 
 
 def split_linear(pv):
-    """Take constant and linear part out of a polynomial, PV = c + L PV'.
+    """Split constant and linear parts from a polynomial, PV = c + L PV'.
 
     Parameters
     ----------
@@ -336,9 +336,9 @@ def split_linear(pv):
     Returns
     -------
     pv : PVPolynomial
-        Without constant and with unit linear terms.
+        Polynomial without a constant, with unit linear terms.
     constant, linear : (2,) and (2, 2) ndarray
-        c (deg) and L.
+        The parts c (deg) and L.
     """
     terms = pv_terms(pv.degree)
     own, other = pv.coefficients

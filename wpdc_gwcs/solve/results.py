@@ -1,4 +1,4 @@
-"""What a solved state is delivered as: one solution per detector, one fit per exposure."""
+"""Results of a solved state: one solution per detector, one fit per exposure."""
 
 from dataclasses import asdict, replace
 
@@ -21,27 +21,27 @@ __all__ = ["frozen_result"]
 
 
 def frozen_result(o, state, stored, infos, group, settings, cd, update):
-    """Frozen results of a solved state.
+    """Return the frozen results of a solved state.
 
     Parameters
     ----------
     o : Observations
         All stars.
     state : State
-        The solved one.
+        Solved state.
     stored : dict
-        Name of a detector to the `~wpdc_gwcs.solution.DistortionSolution` that it had.
+        Previous `~wpdc_gwcs.solution.DistortionSolution` of detectors, by name.
     infos : list
-        What is known of each detector's table, `None` if it has none.
+        `TableInfo` of each detector, `None` without a table.
     group : ndarray of int
         Fold of each star, see `~wpdc_gwcs.solve.tables.folds`.
     settings : dict
-        ``n_grid``, ``lut``, ``refine``, ``degree``, ``pv_degree``, ``weight`` and what else the
-        solutions tell.
+        ``n_grid``, ``lut``, ``refine``, ``degree``, ``pv_degree``, ``weight`` and other
+        settings for the solutions.
     cd : (2, 2) ndarray or None
         Nominal linear map, deg / px.
     update : bool
-        Whether stored solutions were to follow.
+        Whether stored solutions are updated.
 
     Returns
     -------
@@ -107,14 +107,14 @@ def frozen_result(o, state, stored, infos, group, settings, cd, update):
 
 
 def _table_sigma(info, stored, factor):
-    """Uncertainty of what stands beside the shared terms: a smoothed table, a stored solution."""
+    """Uncertainty of the part besides shared terms: a smoothed table or a stored solution."""
     if info is not None and info.sigma is not None:
         return info.sigma * np.array([factor, factor, 1.0])[:, None, None]
     return None if stored is None or info is not None else stored.table_sigma
 
 
 def _with_maps(o, state, group, solutions):
-    """Solutions with the binned residuals behind them, about their polynomials alone."""
+    """Solutions with their binned residuals about the polynomials alone."""
     tables = [solutions[d.name].lookup_table if d.name in solutions else None for d in o.detectors]
     maps = residual_maps(o, state, group, tables)
     return {

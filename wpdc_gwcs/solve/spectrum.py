@@ -1,4 +1,4 @@
-"""The spectrum of the exposures' fields, by evidence.
+"""Spectra of the fields of exposures, by evidence.
 
 ::
 
@@ -19,13 +19,13 @@ __all__ = ["Products", "Spectrum", "learn_spectra", "pooled_spectrum", "products
 # Sum over the waves of a kind of field: a potential's gradient, or each axis by itself.
 KINDS = ("curl-free", "axes")
 
-# Prior of the spectrum of one exposure about the pooled one (natural logarithms), measured on
-# ground-based frames.
+# Scatter of the spectra of exposures about the pooled one (natural logarithms), from ground-based
+# frames.
 _LOG_AMPLITUDE_SCATTER = 1.0
 _LOG_SCALE_SCATTER = 0.7
 _LOG_STRETCH_SCATTER = 0.5
 
-# Exposures, and frames of each, that the pooled spectrum is learned from.
+# Numbers of exposures, and of frames of each, from which the pooled spectrum is learned.
 _EXPOSURES_POOLED, _FRAMES_POOLED = 8, 2
 
 # Gain in log evidence that fields must bring to all exposures together, and what more must add: a
@@ -42,7 +42,7 @@ _BEND_GAIN, _FIRST_BEND, _BEND_DECAY = 10.0, 0.3, 1.8
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Power of a field: von Karman's, stretched along one direction, and polynomials.
+    """Power spectrum of a field: von Karman, stretched along a direction, plus polynomials.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class Spectrum:
         Returns
         -------
         ndarray
-            For ``basis.shapes(..., kind)``.
+            Variances for ``basis.shapes(..., kind)``.
         """
         wave = basis.wave
         k0 = 2 * np.pi / self.scale
@@ -103,7 +103,7 @@ class Spectrum:
         return np.concatenate([power, bends, bends, [constant, constant]])
 
     def unresolved(self, basis):
-        """Variance along each axis that the waves of a basis are too long for, px^2.
+        """Return the variance along each axis below the shortest wave of a basis, px^2.
 
         Parameters
         ----------
@@ -113,7 +113,7 @@ class Spectrum:
         Returns
         -------
         float
-            What remains as noise.
+            Variance that remains as noise.
         """
         highest = np.max(np.sum(basis.wave**2, axis=0)) * (self.scale / (2 * np.pi)) ** 2
         return self.amplitude**2 * (1 + highest) ** (-5 / 6)
@@ -121,7 +121,7 @@ class Spectrum:
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """Weighted products of the waves of one patch: all that evidence needs of the stars.
+    """Weighted products of the waves of a patch, sufficient for the evidence.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class Products:
     matrix, right : dict
         For each kind of field, normal matrix and right-hand side.
     n_stars : int
-        Stars behind them.
+        Number of stars.
     """
 
     basis: Basis
@@ -139,7 +139,7 @@ class Products:
     n_stars: int
 
     def log_evidence(self, spectrum):
-        """Logarithm of the evidence of a spectrum over that of no field.
+        """Return the log evidence of a spectrum relative to no field.
 
         Parameters
         ----------
@@ -149,7 +149,7 @@ class Products:
         Returns
         -------
         float
-            In nats.
+            Log evidence, nats.
         """
         root = np.sqrt(spectrum.prior(self.basis))
         inner = self.matrix[spectrum.kind] * root[:, None] * root
@@ -169,7 +169,7 @@ def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
     basis : Basis
         Waves.
     focal, residual, weight : (2, N) ndarray
-        Places, residuals (px) and inverse variances of the stars.
+        Positions, residuals (px) and inverse variances of the stars.
     nuisance : (2, N, K) ndarray, optional
         Columns fitted freely beside the field: the attitude of a single detector.
     kinds : tuple of str, optional
@@ -178,7 +178,7 @@ def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
     Returns
     -------
     Products
-        For `learn_spectra`.
+        Products for `learn_spectra`.
     """
     matrix, right = {}, {}
     w = weight.ravel()
@@ -201,35 +201,35 @@ def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
 
 
 def learn_spectra(frames, make, *, start, scales, force=False):
-    """Find the spectrum of each exposure by evidence, about one that all exposures share.
+    """Find the spectrum of each exposure by evidence, with a pooled spectrum as prior.
 
     Parameters
     ----------
     frames : dict
-        Exposure to its frames.
+        Frames of each exposure.
     make : callable
         ``make(frame, kinds)`` returns the `Products` of a frame.
     start : float
         First guess of the amplitude, px.
     scales : (float, float)
-        Least and largest outer scale, px.
+        Smallest and largest outer scale, px.
     force : bool, optional
         Return a spectrum for every exposure, whatever the evidence.
 
     Returns
     -------
     dict
-        Exposure to `Spectrum`, `None` for all where the stars do not speak for fields.
+        `Spectrum` of each exposure; `None` for all without evidence for fields.
 
     Notes
     -----
     Maximum a posteriori: the logarithms of amplitude and scale of an exposure scatter by 1 and 0.7
-    about the pooled ones.  A field that all exposures have in common, by evidence, is none of
-    theirs.
+    about the pooled ones.  A field that all exposures have in common, by evidence, belongs to
+    the detector.
     """
     if not frames:
         return {}
-    # A few frames tell what all have in common.
+    # A few frames suffice for the pooled spectrum.
     step = -(-len(frames) // _EXPOSURES_POOLED)
     some = [f for e in sorted(frames)[::step] for f in frames[e][:_FRAMES_POOLED]]
     patches = [make(f, KINDS) for f in some]
@@ -243,14 +243,14 @@ def learn_spectra(frames, make, *, start, scales, force=False):
     found = {}
     for e, members in frames.items():
         group = [make(f, (spectrum.kind,)) for f in members]
-        # Where its own stars say little, an exposure is like the others; where they speak against
-        # a field, the amplitude is small.
+        # With few stars, an exposure gets the pooled spectrum; with evidence against a field, a
+        # small amplitude.
         found[e], _ = _maximize(group, spectrum.kind, start, scales, about=spectrum)
     return found
 
 
 def _is_common(patches, spectrum):
-    """Return whether all exposures of a detector have the same field: then it is the detector's."""
+    """Return whether all exposures of a detector have the same field, so that it is static."""
     each = common = 0.0
     for basis in {id(p.basis): p.basis for p in patches}.values():
         mine = [p for p in patches if p.basis is basis]
@@ -266,21 +266,21 @@ def _is_common(patches, spectrum):
 
 
 def pooled_spectrum(patches, *, start, scales):
-    """Find the spectrum that several patches have in common.
+    """Find the common spectrum of several patches.
 
     Parameters
     ----------
     patches : list of Products
-        Stars of each, with all kinds of field.
+        Products of each patch, for all kinds of field.
     start : float
         First guess of the amplitude, px.
     scales : (float, float)
-        Least and largest outer scale, px.
+        Smallest and largest outer scale, px.
 
     Returns
     -------
     Spectrum or None
-        `None` if the stars do not speak for a field.
+        `None` without evidence for a field.
     """
     straight = [_maximize(patches, kind, start, scales) for kind in KINDS]
     spectrum, gain = max(straight, key=_gain)
@@ -293,7 +293,7 @@ def pooled_spectrum(patches, *, start, scales):
 
 
 def _maximize(group, kind, start, scales, about=None):
-    """Spectrum of the largest evidence (with the prior about another), and its gain in nats."""
+    """Spectrum with the largest evidence (and prior about another one), and its gain in nats."""
     low, high = np.log(scales)
 
     def spectrum_of(p):
@@ -356,7 +356,7 @@ def _penalty(p, scales, about):
 
 
 def _bent(group, straight, scales, about=None):
-    """Spectrum of the largest evidence with polynomials beside the waves, and its gain in nats."""
+    """Spectrum with polynomials of the largest evidence, and its gain in nats."""
     low, high = np.log(scales)
     first = about.bend if about is not None else _FIRST_BEND * straight.amplitude
 

@@ -1,6 +1,6 @@
-"""State of a solution between two steps, and the linear step that makes the next one.
+"""The state of a solution between steps, and the linear step to the next one.
 
-Everything is a function of frozen state: observations and a state in, a new state out.
+Functions take observations and a frozen state, and return a new state.
 """
 
 import logging
@@ -24,16 +24,16 @@ __all__ = ["State", "linear_step", "predict_variance", "with_clipping", "with_er
 
 log = logging.getLogger(__name__)
 
-# Fewer exposures do not tell how much attitudes vary.
+# Minimum number of exposures to estimate the scatter of attitudes.
 _MIN_EXPOSURES_POOL = 5
 
-# Linear maps that differ by more than this do so on purpose (another roll of the camera).
+# Linear maps that differ by more than this are intentional (another roll of the camera).
 _MAX_POOLED = 0.05
 
-# Frames of more stars than this have no star that the model follows.
+# With more stars than this in a frame, leverages are negligible.
 _MAX_STARS_LEVERAGE = 200
 
-# Standard deviations are not learned to be smaller, px: of any group, of color terms per magnitude.
+# Minimum learned standard deviations, px: of any group; of color terms, per magnitude.
 _LEAST_SIGMA, _LEAST_COLOR = 1e-9, 1e-4
 
 
@@ -50,21 +50,21 @@ class State:
     kept : (N,) ndarray of bool
         Pairs that are fitted.
     reason : tuple
-        For each frame why it was left out, or `None`.
+        Reason why each frame was left out, or `None`.
     spectra : dict
-        Exposure to the spectrum of its field, or `None`.
+        Spectrum of the field of each exposure, or `None`.
     bases : dict
-        Detector to the waves of its patch, for the fields that are marginalized.
+        Basis of each detector for fields that are marginalized.
     error_models : dict
         Scale and floor of the errors.
     pooled : dict
-        Standard deviations of the attitudes' linear modes between exposures.
+        Scatter of the linear modes of attitudes between exposures.
     pull : tuple, optional
         Prior variances and means of those modes.
     own : (E, K, K) ndarray, optional
         Normal matrices of the exposures, with their priors, of the last linear step.
     posterior : Posterior, optional
-        Of the last linear step.
+        Posterior of the last linear step.
     freedom : float
         Effective number of parameters of the last linear step.
     """
@@ -100,7 +100,7 @@ class State:
         return self.spectra.get(int(o.exposure_of[frame]))
 
     def noise(self, o, frame):
-        """Variances of a frame's pairs along the focal plane, what its waves leave included.
+        """Return variances of the pairs along the focal plane, including unresolved waves.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ def _products(o, state):
 
 
 def linear_step(o, state, *, learn=10, pool=True):
-    """Solve for all terms at once about the present model, and learn their variances.
+    """Solve for all terms at once about the current model, and learn their variances.
 
     Parameters
     ----------
@@ -146,12 +146,12 @@ def linear_step(o, state, *, learn=10, pool=True):
     learn : int, optional
         Steps of expectation maximization of the variances.
     pool : bool, optional
-        Whether attitudes are drawn toward their mean by as much as they vary.
+        Whether attitudes are shrunk toward their mean according to their scatter.
 
     Returns
     -------
     State
-        With the new model and its posterior.
+        State with the new model and its posterior.
     """
     model = state.model
     scopes = [model.scoped(scope) for scope in ("camera", "detector", "exposure")]
@@ -172,7 +172,7 @@ def linear_step(o, state, *, learn=10, pool=True):
             sigma = _learned(scopes, sigma, values, found)
     model = _applied(model, scopes, values, found, sigma)
     freedom = _freedom(found, priors, own)
-    # The means are those of the most probable variances, the errors know that these are uncertain.
+    # The means are for the most probable variances; the errors include their uncertainty.
     wide = _inflated(scopes, sigma, found)
     priors = [np.broadcast_to(_precision(t, wide), v.shape) for t, v in zip(scopes, values)]
     found = posterior(blocks, *priors, own, (*pulls, own_pull))
@@ -216,7 +216,7 @@ def _learned(scopes, sigma, values, found):
 
 
 def _inflated(scopes, sigma, found):
-    """Widen the standard deviations of all groups by what is not known of them."""
+    """Inflate the standard deviations of all groups for their uncertainty."""
     out = dict(sigma)
     for terms, variance in zip(scopes, found.variances()):
         variance = np.atleast_2d(variance)
@@ -256,7 +256,7 @@ def _exposure_prior(o, state, own):
 
 
 def _freedom(found, priors, own):
-    """Effective number of parameters: what the priors fix is none."""
+    """Effective number of parameters, without those fixed by priors."""
     total = 0.0
     for prior, variance in zip(priors, found.variances()):
         total += variance.size - np.sum(prior * variance)
@@ -300,7 +300,7 @@ def _pooled(o, state, own):
     b = np.linalg.solve(center, cd) - np.eye(2)
     if len(active) < _MIN_EXPOSURES_POOL or np.abs(b[active]).max() > _MAX_POOLED:
         return replace(state, pull=None, pooled={})
-    # What the stars of each exposure say by themselves: the prior is taken off again.
+    # Estimates from the stars of each exposure alone: remove the prior.
     precision, pull = _exposure_prior(o, state, own)
     before, _ = _exposure_prior(o, replace(state, pull=None), own)
     radius = state.model.geometry.radius
@@ -320,7 +320,7 @@ def _pooled(o, state, own):
 
 
 def all_residuals(o, state, *, with_field=True):
-    """Residuals of all pairs along the axes of their detectors, px.
+    """Return the residuals of all pairs along the axes of their detectors, px.
 
     Parameters
     ----------
@@ -339,7 +339,7 @@ def all_residuals(o, state, *, with_field=True):
 
 
 def with_clipping(o, state, clip, *, local=np.inf, relax=1.0):
-    """State with the pairs kept decided anew; see `clip_outliers`.
+    """Return the state with outliers clipped again; see `clip_outliers`.
 
     Parameters
     ----------
@@ -366,7 +366,7 @@ def with_clipping(o, state, clip, *, local=np.inf, relax=1.0):
             [0, 1], [0, 1]
         ]
         ratio = variance / state.sigma[:, s] ** 2
-        # Of a star that is fitted the residual is smaller than its error, of another larger.
+        # The residual of a fitted star is smaller than its error, that of others larger.
         leverage[:, s] = np.where(state.kept[s], np.minimum(ratio, 0.999), -ratio)
     usable = np.zeros(len(o), bool)
     for f in state.active:
@@ -377,7 +377,7 @@ def with_clipping(o, state, clip, *, local=np.inf, relax=1.0):
 
 
 def with_error_models(o, state):
-    """State with scale and floor of the errors from the residuals; see `error_model`.
+    """Return the state with new scale and floor of the errors; see `error_model`.
 
     Parameters
     ----------
@@ -416,7 +416,7 @@ def with_error_models(o, state):
 
 
 def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrument_only=False):
-    """Covariance of the calibrated position of pixels of a frame, without centroid errors.
+    """Return the covariance of calibrated positions of pixels, without centroid errors.
 
     Parameters
     ----------
@@ -429,8 +429,8 @@ def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrume
     x, y : (N,) ndarray
         Pixels.
     table : (2, 2, N) ndarray, optional
-        Covariance of the look-up table: where it is larger than that of the shared terms, it takes
-        their place, for both describe the same surface.
+        Covariance of the look-up table; it replaces that of the shared terms where it is larger,
+        because both describe the same surface.
     growth : (N,) ndarray, optional
         Factors of the standard deviations of the shared terms, see `extrapolation`.
     instrument_only : bool, optional
@@ -445,7 +445,7 @@ def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrume
     -----
     With w the shared terms, a the exposure's numbers and c the field, whose means follow w and a
     through the stars: cov = v C_w v^T + cov(a | w) + cov(c | w, a), v the row of the shared terms
-    less what a and c follow.
+    minus the response of a and c.
     """
     model, found = state.model, state.posterior
     k, e = int(o.detector_of[frame]), int(o.exposure_of[frame])
@@ -483,7 +483,7 @@ def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrume
 
 
 def _with_field(o, state, frame, x, y, rows):
-    """Rows of pixels less what the field follows, and the field's own covariance."""
+    """Rows of pixels minus the response of the field, and the covariance of the field."""
     model = state.model
     posterior_field = model.fields[frame]
     s = o.slices[frame]

@@ -4,7 +4,7 @@
 
     residuals about the stored table = change (common) + field (each exposure) + noise
         --evidence--> no change: residuals are pooled with the stored ones
-                      a change: the stored ones are moved by it and count for less, then pooled
+                      a change: the stored ones are shifted by it and downweighted, then pooled
 """
 
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ class StoredMap:
     solution: object
 
     def __call__(self, x, y):
-        """Displacement of pixels.
+        """Return the displacement of pixels.
 
         Parameters
         ----------
@@ -50,7 +50,7 @@ class StoredMap:
 
 
 def unswallowed_maps(o, state, group, base, commons):
-    """Residual maps without the exposures' fields, but with all that the exposures share.
+    """Build residual maps without the fields of exposures, but with common residuals.
 
     Parameters
     ----------
@@ -61,9 +61,9 @@ def unswallowed_maps(o, state, group, base, commons):
     group : (N,) ndarray of int
         Group of each pair in cross-validation.
     base : sequence of callable
-        For each detector what to put back instead of its present table.
+        Displacements to add back for each detector instead of its current table.
     commons : dict
-        Detector to the `Change` that its exposures have in common.
+        Common `Change` of the exposures of each detector.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def unswallowed_maps(o, state, group, base, commons):
 
 
 def change_on(o, state, k, change, x, y):
-    """Displacement of pixels of a detector by a change, and its covariance.
+    """Return the displacement of pixels by a change, and its covariance.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def change_on(o, state, k, change, x, y):
     k : int
         Number of the detector.
     change : Change
-        Of the focal plane.
+        Change of the focal plane.
     x, y : (N,) ndarray
         Pixels.
 
@@ -126,7 +126,7 @@ def updated_solution(o, state, k, change, solution, new, n_grid):
     k : int
         Number of the detector.
     change : Change or None
-        What the new exposures say; `None` if the detector has none.
+        Change found in the new exposures; `None` if the detector has none.
     solution : DistortionSolution
         The stored solution.
     new : ResidualMap
@@ -137,9 +137,9 @@ def updated_solution(o, state, k, change, solution, new, n_grid):
     Returns
     -------
     solution : DistortionSolution
-        Updated; ``statistics["updates"]`` has one entry more.
+        Updated solution; ``statistics["updates"]`` has a new entry.
     info : TableInfo
-        Of its table.
+        Information about its table.
     """
     entry = {
         "n_exposures": 0 if change is None else len({
@@ -155,7 +155,7 @@ def updated_solution(o, state, k, change, solution, new, n_grid):
         old, summary = follow(o, state, k, change, solution)
         entry |= summary
     merged = old + new
-    # The table of a detector of a mosaic comes from more than its own stars.
+    # The table of a detector in a mosaic depends on the stars of others, too.
     of_mosaic = "optics" in solution.statistics.get("learned", {}) or len(o.detectors) > 1
     choice, candidates = (TableChoice("none"), ()) if of_mosaic else choose_table(merged)
     table, info = build_lookup_table(merged, n_grid, choice=choice)
@@ -165,12 +165,12 @@ def updated_solution(o, state, k, change, solution, new, n_grid):
         if change is not None:
             table = _moved_table(o, state, k, change, table, n_grid)
     if change is not None:
-        # The table knows the errors of the stars, not the fields of the exposures.
+        # The table accounts for the errors of stars, not for the fields of exposures.
         x, y = o.detectors[k].grid(n_grid)
         _, covariance = change_on(o, state, k, change, x, y)
         spread = covariance[[0, 1], [0, 1]]
         if not moved:
-            # Where the stored map was less certain than elsewhere, it still is.
+            # Keep a larger uncertainty of the stored map.
             before = solution.covariance(x, y)[[0, 1], [0, 1]]
             if np.all(before > 0):
                 spread = before * min(np.mean(spread) / np.mean(before), 1.0)
@@ -188,7 +188,7 @@ def updated_solution(o, state, k, change, solution, new, n_grid):
 
 
 def _moved_table(o, state, k, change, table, n_grid):
-    """Table of a detector after a change, which may be the first to need one."""
+    """Table of a detector after a change, even if it had none before."""
     if not np.any(change.coefficients):
         return table
     if table is None:
@@ -203,7 +203,7 @@ def _moved_table(o, state, k, change, table, n_grid):
 
 
 def follow(o, state, k, change, solution):
-    """Residual map of a stored solution after a change, and the change on the detector.
+    """Return the residual map of a stored solution after a change, and a summary of it.
 
     Parameters
     ----------
@@ -214,14 +214,14 @@ def follow(o, state, k, change, solution):
     k : int
         Number of the detector.
     change : Change
-        What has changed.
+        The change.
     solution : DistortionSolution
         The stored solution.
 
     Returns
     -------
     residual_map : ResidualMap
-        Moved, and of as much less weight as the change is less certain than the stored table.
+        Shifted map, downweighted according to the uncertainty of the change.
     summary : dict
         ``rms_change_px`` and ``max_change_px`` over the detector.
     """

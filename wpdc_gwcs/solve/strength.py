@@ -1,4 +1,4 @@
-"""Strength of the exposures' fields, as stored solutions remember it for the exposures to come."""
+"""Typical strength of fields, stored with a solution as a prior for later exposures."""
 
 import numpy as np
 
@@ -18,18 +18,18 @@ _LOG_SCALE, _LOG_UNKNOWN = 0.7, 1.5
 
 
 class FieldPrior:
-    """What is known of the strength of an exposure's field.
+    """Prior of the strength of the field of an exposure.
 
     Parameters
     ----------
     known : dict or None
-        Of the exposures of the stored solution, see `summarize_fields`.
+        Summary of the stored solution, see `summarize_fields`.
     errors : float
         Typical error of a star, px.
     scales : (2,) ndarray
-        Logarithms of the least and the largest outer scale, px.
+        Logarithms of the smallest and the largest outer scale, px.
     wavelength : float
-        Where the strength is counted, px, see `log_strength`.
+        Wavelength of the strength, px, see `log_strength`.
     """
 
     def __init__(self, known, errors, scales, wavelength):
@@ -46,7 +46,7 @@ class FieldPrior:
         self.strength = level + log_strength(0.0, self.scale, wavelength)
 
     def penalty(self, amplitude, scale):
-        """Minus the log prior.
+        """Return minus the log prior.
 
         Parameters
         ----------
@@ -58,10 +58,10 @@ class FieldPrior:
 
 
 def log_strength(amplitude, scale, wavelength):
-    """Logarithm of the root of a field's power at a wavelength, from those of amplitude and scale.
+    """Return the log strength of a field at a wavelength, from log amplitude and log scale.
 
-    At half the side of a detector it is well known; amplitude and outer scale, mostly larger than
-    the detector, are not.
+    This is half the log power.  At half the side of a detector it is well determined, unlike
+    amplitude and outer scale, which is mostly larger than the detector.
 
     Parameters
     ----------
@@ -78,22 +78,22 @@ def _log_amplitude(spectrum):
 
 
 def summarize_fields(spectra, image_shape, previous=None):
-    """Typical field of some exposures, for the updates to come.
+    """Summarize the fields of exposures, for later updates.
 
     Parameters
     ----------
     spectra : sequence of Spectrum or None
-        Of the exposures; `None` for none.
+        Spectra of the exposures; `None` for none.
     image_shape : (int, int)
         Shape of the detector.
     previous : dict, optional
-        The same of the exposures of the stored solution.
+        Summary of the stored solution.
 
     Returns
     -------
     dict
         ``n`` exposures, ``amplitude`` (px) and ``scale`` (px) of the typical field, and
-        ``scatter`` of the logarithm of the strength; amplitude 0 where there were no fields.
+        ``scatter`` of the logarithm of the strength; amplitude 0 without fields.
     """
     found = [s for s in spectra if s is not None]
     n, guess = len(spectra), _GUESS_WEIGHT * _LOG_STRENGTH**2

@@ -1,4 +1,4 @@
-"""Smooth displacements sampled on a grid: quick to evaluate again and again."""
+"""Smooth displacements sampled on a grid, for fast repeated evaluation."""
 
 from dataclasses import dataclass
 
@@ -7,11 +7,11 @@ from scipy.interpolate import RectBivariateSpline
 
 __all__ = ["SampledField", "SummedField", "TableSurface", "of_field", "of_table"]
 
-# Nodes for the shortest wave of a field: the spline then is good to a thousandth of it.
+# Nodes per shortest wave of a field: the spline is accurate to a thousandth of its amplitude.
 _NODES_PER_WAVE = 6
 
-# Steps by which the grid of a field reaches beyond its box on each side: distortion takes stars
-# over the rim.
+# Steps by which the grid of a field extends beyond its box on each side: distortion moves stars
+# over the edge.
 _BEYOND = 2
 
 
@@ -22,13 +22,13 @@ class TableSurface:
     Parameters
     ----------
     splines : tuple of RectBivariateSpline
-        Of both axes, as functions of (x, y).
+        Splines of both axes, as functions of (x, y).
     """
 
     splines: tuple
 
     def __call__(self, x, y):
-        """Displacement of pixels.
+        """Return the displacement of pixels.
 
         Parameters
         ----------
@@ -52,7 +52,7 @@ class SampledField:
     field : Field
         The field, for its covariance.
     surface : TableSurface
-        Its values.
+        Its sampled values.
     """
 
     field: object
@@ -74,7 +74,7 @@ class SampledField:
         return self.surface(*focal)
 
     def covariance(self, focal):
-        """Posterior covariance, see `Field`.
+        """Return the posterior covariance, see `Field`.
 
         Parameters
         ----------
@@ -96,7 +96,7 @@ class SummedField:
     Parameters
     ----------
     parts : tuple of SampledField
-        What is added.
+        The fields.
     """
 
     parts: tuple
@@ -117,7 +117,7 @@ class SummedField:
         return sum(part(focal) for part in self.parts)
 
     def covariance(self, focal):
-        """Posterior covariance.
+        """Return the posterior covariance.
 
         Parameters
         ----------
@@ -133,7 +133,7 @@ class SummedField:
 
 
 def of_table(table):
-    """Put a look-up table into splines that are set up once.
+    """Convert a look-up table to splines that are set up once.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def of_field(field, low, high, *, least_steps=1):
     low, high : (2,) ndarray
         Corners, px.
     least_steps : int, optional
-        Of the grid, over the box.
+        Minimum number of grid steps over the box.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Look-up tables of the detectors: what the terms leave, binned and interpolated."""
+"""Look-up tables of the detectors: residuals of the terms, binned and interpolated."""
 
 from dataclasses import replace
 
@@ -10,18 +10,18 @@ from wpdc_gwcs.solve.surface import of_table
 
 __all__ = ["choose_tables", "folds", "residual_maps", "with_tables"]
 
-# Detectors of a camera whose tables are all tried in every way; the others take their settings.
+# Maximum number of detectors for which all settings of tables are tried; others adopt theirs.
 _DETECTORS_TRIED = 3
 
-# With more stars than this a detector knows its own structure better than others do.
+# With more stars than this, a detector determines its settings better than others do.
 _OWN_SETTINGS = 6000
 
-# Detectors with fewer stars than this share of the richest one find settings of their own.
+# Detectors with fewer stars than this fraction of the richest one get their own settings.
 _SHARE_OF_STARS = 0.25
 
 
 def folds(o, seed):
-    """Group of each pair for cross-validation: by exposure, or at random for one or two.
+    """Return the cross-validation group of each pair: by exposure, or random for one or two.
 
     Parameters
     ----------
@@ -45,11 +45,11 @@ def residual_maps(o, state, group, base=None):
     o : Observations
         Pairs.
     state : State
-        Where the solution stands.
+        Current state.
     group : (N,) ndarray of int
         Group of each pair in cross-validation.
     base : sequence of callable, optional
-        For each detector what to put back instead of its present table.
+        Displacements to add back for each detector instead of its current table.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def _with_unresolved(o, state, f):
 
 
 def with_tables(o, state, group, n_grid, lut, *, choices=None, draft=False):
-    """State with the tables made anew of what is left.
+    """Return the state with new tables of the remaining residuals.
 
     Parameters
     ----------
@@ -108,9 +108,9 @@ def with_tables(o, state, group, n_grid, lut, *, choices=None, draft=False):
     Returns
     -------
     state : State
-        With new tables.
+        State with new tables.
     infos : list of TableInfo
-        How they came about.
+        Information about them.
     """
     maps = residual_maps(o, state, group)
     tables, infos = [], []
@@ -134,8 +134,8 @@ def choose_tables(maps, lut):
     Returns
     -------
     list of (TableChoice, tuple)
-        Settings and the candidates they were chosen from; in a large camera detectors of some
-        stars take the settings of those with the most.
+        Settings and the candidates they were chosen from; in a large camera, detectors
+        adopt the settings of those with the most stars.
     """
     if len(maps) <= _DETECTORS_TRIED:
         return [choose_table(m, lut=lut) for m in maps]

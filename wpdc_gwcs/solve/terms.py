@@ -31,13 +31,13 @@ class Block:
     Parameters
     ----------
     u, v : (N,) ndarray
-        Place on the detector, -1 to 1 along each side.
+        Position on the detector, -1 to 1 along each side.
     aspect : (2,) ndarray
         Sides in units of the longer one.
     focal : (2, N) ndarray
-        Place in the focal plane in units of its radius.
+        Position in the focal plane in units of its radius.
     color : (N,) ndarray
-        Color less the reference color.
+        Color minus the reference color.
     """
 
     u: np.ndarray
@@ -56,14 +56,14 @@ class Term:
     name : str
         Name, for logs and statistics.
     scope : {'camera', 'detector', 'exposure'}
-        What has coefficients of its own.
+        Whether the camera, each detector or each exposure has its own coefficients.
     groups : (K,) ndarray of int
         Group of each coefficient: the coefficients of one group share a variance.
     start : (G,) ndarray
         Standard deviation of each group before anything is learned, px.
     decay : float
-        Factor by which a group is expected to be smaller than the one before, where there is a
-        sequence of them (degrees); 0 for groups of their own.
+        Factor by which a group is expected to be smaller than the one before, for a sequence
+        of groups (degrees); 0 for independent groups.
     shapes : callable
         ``shapes(block) -> (p, N)``, functions of the place that displacements along both axes are
         made of.
@@ -89,7 +89,7 @@ class Term:
         return len(self.groups)
 
     def displacement(self, block, coefficients):
-        """Displacements by known coefficients.
+        """Return displacements for given coefficients.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class Term:
         return each.reshape(2, -1) @ shapes
 
     def design(self, block):
-        """Displacements of unit coefficients.
+        """Return displacements of unit coefficients.
 
         Parameters
         ----------
@@ -129,14 +129,14 @@ class Term:
         return np.moveaxis(each, 0, -1)
 
 
-# How much smaller a degree of a polynomial is expected to be than the degree before it.
+# Expected ratio of one degree of a polynomial to the degree before.
 _DECAY = 1.8
 
 # Broad starts, px: what is learned replaces them.  Distortion of degree 2 of one detector alone,
 # and of a detector in a mosaic, whose optics take the most; optics; shift and turn of a detector.
 _START, _START_MOSAIC, _START_OPTICS, _START_PLACE = 100.0, 3.0, 300.0, 10.0
 
-# The same of terms in color, px per magnitude.
+# The same for terms in color, px per magnitude.
 _START_COLOR = 0.1
 
 
@@ -145,12 +145,12 @@ def _degrees(first, last):
 
 
 def legendre_products(a, b, first, last, aspect=(1.0, 1.0)):
-    """Products of Legendre polynomials of the total degrees first to last.
+    """Return products of Legendre polynomials of total degrees first to last.
 
     Parameters
     ----------
     a, b : (N,) ndarray
-        Place, -1 to 1 along each side.
+        Position, -1 to 1 along each side.
     first, last : int
         Total degrees.
     aspect : (2,) array_like, optional
@@ -165,7 +165,7 @@ def legendre_products(a, b, first, last, aspect=(1.0, 1.0)):
     -----
     One variance is to serve all shapes of a degree.  Those of one degree have the same mean square
     over the detector, as in a field that is the same everywhere: with equal coefficients, mixed
-    terms would be smaller than they are in lenses, and the middle calmer than the rim.  Along a
+    terms would be smaller than they are in lenses, and the middle calmer than the edge.  Along a
     short side a polynomial of the same curvature is smaller: shapes are scaled by the sides.
     """
     p, q = (_normalized(c, last, side) for c, side in zip((a, b), aspect))
@@ -359,7 +359,7 @@ def lateral_color():
     Returns
     -------
     Term
-        Radial columns of the first and third power, px per magnitude at the rim.
+        Radial columns of the first and third power, px per magnitude at the edge.
     """
 
     def shapes(b):

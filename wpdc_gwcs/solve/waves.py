@@ -1,8 +1,8 @@
 """The structure of a detector: few shapes out of many, found by sparse Bayesian learning.
 
-What the terms leave of a detector is neither noise nor one smooth random field: it is made of some
-waves and high polynomials, and most others are absent.  Each has a variance of its own, which the
-stars tell; those that they do not speak for shrink to nothing, so that the many candidates add no
+The residual structure of a detector is neither noise nor a smooth random field: it consists of some
+waves and high-degree polynomials, and most others are absent.  Each shape has its own variance,
+learned from the stars; shapes without evidence shrink to zero, so that the many candidates add no
 noise.
 
 ::
@@ -20,7 +20,7 @@ from scipy.linalg import lapack
 __all__ = ["Waves", "candidates", "fit_waves"]
 
 # The period of the waves is so many times the detector: finer steps of the wave number than
-# its own size, because a wave of the sensor does not end at its rim.
+# its own size, because a wave of the sensor does not end at its edge.
 _OVERSIZE = 1.6
 
 # Shortest wave in units of the longer side.
@@ -41,43 +41,43 @@ _OUTERMOST = CubicSpline(np.arange(_NODES), np.eye(_NODES)[0])
 # quarter of a coefficient for each ten candidates remains, in units of its error.
 _FLOOR, _GUESS_WEIGHT = 0.02, 1.0
 
-# Steps of the variances, by then they move by a few percent.
+# Number of updates of the variances; the last ones change them by a few percent.
 _STEPS = 8
 
 # Times that the step of the wave numbers is halved about those waves of which the stars determine
 # so many coefficients: a wave between two candidates would need many of them.
 _ZOOMS, _SEEN = 2, 0.5
 
-# Most waves that a finer step is tried for; those of the largest power.
+# Maximum number of waves refined by a finer step: those with the largest power.
 _MOST_ZOOMED = 60
 
-# With more stars than this they are averaged in cells, so many along the shortest wave.
+# With more stars than this, they are averaged in cells, this many per shortest wave.
 _MOST_STARS, _CELLS_PER_WAVE = 20_000, 16
 
-# Stars of which the columns are held in memory at once.
+# Number of stars whose columns are in memory at once.
 _BLOCK = 2048
 
 
 @dataclass(frozen=True, eq=False)
 class Waves:
-    """Displacements of the focal plane: plane waves, polynomials, and what the rims differ by.
+    """Displacements of the focal plane: plane waves, polynomials, and edge effects.
 
     Parameters
     ----------
     center, size : (2,) ndarray
-        Middle and sides of the detector's part of the focal plane, px.
+        Center and sides of the part of the focal plane that the detector covers, px.
     orders : (2, M) ndarray of int
         Wave vectors in units of the step.
     step : (2,) ndarray
         Rad / px.
     least_degree : int
-        Of the polynomials; those below are in other terms.
+        Lowest degree of the polynomials; lower ones are in other terms.
     coefficients : (2, K) ndarray
-        Of cosines, sines, polynomials and rims, for each axis, px.
+        Coefficients of cosines, sines, polynomials and edges, for each axis, px.
     taken : (F, K) ndarray
-        What the polynomials of lower degree take of each shape, where the stars are.
+        Response of the lower polynomials to each shape, at the stars.
     half : (K, K) ndarray
-        Products of these with themselves, H^T H, are the covariance of the coefficients of an axis.
+        Half H of the covariance H^T H of the coefficients of an axis.
     """
 
     center: np.ndarray
@@ -90,7 +90,7 @@ class Waves:
     half: np.ndarray
 
     def __call__(self, focal):
-        """Displacement at focal plane positions.
+        """Return the displacement at focal plane positions.
 
         Parameters
         ----------
@@ -105,7 +105,7 @@ class Waves:
         return self.coefficients @ self._shapes(focal)
 
     def covariance(self, focal):
-        """Posterior covariance, the same along both axes, with what other terms make up for.
+        """Return the posterior covariance, the same along both axes, with the response of others.
 
         Parameters
         ----------
@@ -133,7 +133,7 @@ class Waves:
 
 
 def _shapes(center, size, orders, step, least_degree, focal):
-    """Cosines and sines, the polynomials of the higher degrees, and the rims, ``(K, N)``."""
+    """Cosines, sines, high-degree polynomials and edges, ``(K, N)``."""
     # A wave along the plane is the product of waves along its axes.
     reach = np.abs(orders).max(1)
     along, across = (
@@ -162,7 +162,7 @@ def _polynomials(center, size, focal, degrees):
 
 
 def candidates(low, high):
-    """Wave vectors of all waves that a detector may have, and the step between them.
+    """Return the wave vectors of all candidate waves of a detector, and their step.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def candidates(low, high):
     Returns
     -------
     orders : (2, M) ndarray of int
-        In units of the step; of each pair of opposite vectors one.
+        Wave vectors in units of the step; one of each pair of opposite vectors.
     step : (2,) ndarray
         Rad / px.
     """
@@ -187,10 +187,10 @@ def candidates(low, high):
 
 
 def _finer(orders, strong):
-    """Orders for half the step: the same ones, and those round the strong ones, once."""
+    """Orders for half the step: the same ones, and neighbors of strong ones, once each."""
     around = np.array(np.meshgrid([-1, 0, 1], [-1, 0, 1])).reshape(2, 1, 9)
     every = np.hstack([2 * orders, (2 * strong[:, :, None] + around).reshape(2, -1)])
-    # Of opposite vectors one; the constant is no wave.
+    # One of opposite vectors; the constant is not a wave.
     every = np.where((every[1] < 0) | ((every[1] == 0) & (every[0] < 0)), -every, every)
     return np.unique(every[:, np.any(every != 0, axis=0)], axis=1)
 
@@ -203,12 +203,12 @@ def fit_waves(low, high, focal, residual, variance):
     low, high : (2,) ndarray
         Corners of its part of the focal plane, px.
     focal, residual, variance : (2, N) ndarray
-        Places, residuals and their variances, px.
+        Positions, residuals and their variances, px.
 
     Returns
     -------
     Waves
-        Beside polynomials of low degree, which are not part of them.
+        The waves, without polynomials of low degree.
 
     Notes
     -----
@@ -246,7 +246,7 @@ def fit_waves(low, high, focal, residual, variance):
 def _learned(normal, right, told, n):
     """Prior standard deviation of each coefficient, and how many of each wave are determined."""
     own = np.arange(n, len(normal) - n)
-    # A detector that rolls off at one rim does so at all.
+    # A detector with an edge effect has it at all edges.
     group = np.concatenate([np.arange(n), np.arange(n), np.minimum(own, own[-_RIMS])])
     # What its own stars tell, those at a rim are few; waves have half of all stars each.
     least = _FLOOR * np.bincount(group) / np.bincount(group, 2.0 * told)
@@ -270,7 +270,7 @@ def _factor(normal, root):
 
 
 def _normal_equations(shape, focal, residual, weight):
-    """Take free polynomials out of the normal matrix and the right-hand sides."""
+    """Eliminate free polynomials from the normal matrix and the right-hand sides."""
     total = 0.0
     for start in range(0, len(weight), _BLOCK):
         s = slice(start, start + _BLOCK)
@@ -295,7 +295,7 @@ def _normal_equations(shape, focal, residual, weight):
 
 
 def _averaged(focal, residual, weight, side):
-    """Stars of each cell as one."""
+    """Average the stars of each cell."""
     cell = ((focal - focal.min(1, keepdims=True)) / side).astype(int)
     _, number = np.unique(cell[0] * (cell[1].max() + 1) + cell[1], return_inverse=True)
     total = np.bincount(number, weight)
