@@ -2,8 +2,8 @@
 
 from importlib import import_module
 
-# Public name -> module that defines it.  Resolved on first use (PEP 562), so that to import the
-# package, which asdf does for every file it opens, stays light.
+# Public name -> module that defines it.  Resolved on first use (PEP 562) to keep the import of the
+# package light: asdf imports it for every file that it opens.
 _PUBLIC = {
     "PVPolynomial": "models",
     "LookupTable": "models",

@@ -1,4 +1,4 @@
-"""`wpdc` and ``python -m wpdc_gwcs``: so little that Ctrl-C finds it ready at once."""
+"""`wpdc` and ``python -m wpdc_gwcs``: minimal, so that Ctrl-C works from the start."""
 
 import gc
 import os
@@ -9,14 +9,14 @@ __all__ = ["main", "prepare"]
 
 def prepare():
     """Set the process up for its work, before NumPy is imported."""
-    # Until its own handler is there, an interrupted program ends without a word.
+    # Until the handler is installed, an interrupted program ends silently.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    # With the imports come a hundred thousand objects that stay: to look through them for cycles
-    # after every 700 takes a fifteenth of the time of a small frame.
+    # Imports create a hundred thousand permanent objects: a search for cycles after every 700 of
+    # them takes a fifteenth of the time of a small frame.
     gc.set_threshold(20_000, 10, 10)
-    # NumPy asks for huge pages for large arrays.  The system clears each of them at once, out of
-    # the cache of the processor, which takes twice the time of clearing small ones as they are met.
+    # NumPy requests huge pages for large arrays.  The system clears each as a whole, outside the
+    # cache, which takes twice the time of clearing small pages on first use.
     os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")
 
 

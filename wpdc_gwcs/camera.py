@@ -27,9 +27,9 @@ class Camera:
     detectors : tuple of str
         Names of its detectors.
     reference : str
-        The detector in whose undistorted px, from its reference point, the focal plane is.
+        Detector whose undistorted px, from its reference point, are the units of the focal plane.
     places : (D, 2) ndarray
-        Reference point of each detector in the focal plane, px; tangent plane about that of
+        Reference point of each detector in the focal plane, px, on the tangent plane about that of
         ``reference``.
     matrices : (D, 2, 2) ndarray
         Focal plane px per undistorted px of each detector.
@@ -40,11 +40,11 @@ class Camera:
     learned : dict
         Standard deviations (px) of the terms of the model, estimated from the stars.
     files : dict
-        Detector to the file of its solution, relative to that of the camera.
+        Solution file of each detector, relative to that of the camera.
     solutions : dict
-        Detector to its `DistortionSolution`, in memory; in files of their own on disk.
+        `DistortionSolution` of each detector; on disk, these are separate files.
     provenance : dict
-        How the camera came about.
+        Origin of the camera.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Camera:
         return as_html(self)
 
     def focal_plane(self, detector, x, y):
-        """Focal plane position of pixels of a detector.
+        """Return the focal plane position of pixels of a detector.
 
         Parameters
         ----------
@@ -87,7 +87,7 @@ class Camera:
         Returns
         -------
         x, y : ndarray
-            Focal plane, px; it goes on off the detector.
+            Focal plane, px; also defined outside the detector.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class Camera:
 
 
 def build_camera(name, exposures, solutions, *, provenance=None):
-    """Camera of the detectors of some calibrated exposures.
+    """Build a camera from calibrated exposures.
 
     Parameters
     ----------
@@ -114,15 +114,15 @@ def build_camera(name, exposures, solutions, *, provenance=None):
     exposures : sequence of list of Calibration
         Frames of each exposure.
     solutions : dict
-        Detector to its solution.
+        Solution of each detector.
     provenance : dict, optional
-        How it came about.
+        Origin of the camera.
 
     Returns
     -------
     Camera
-        With the mean places over the exposures; detectors that share none with the others, not
-        even by a third, are left out.
+        Camera with the mean places over the exposures; detectors that are not connected to the
+        others by exposures, even indirectly, are left out.
     """
     by_detector = [{c.solution.detector: c for c in frames} for frames in exposures]
     names = [n for n in solutions if any(n in frames for frames in by_detector)]

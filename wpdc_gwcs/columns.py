@@ -1,7 +1,8 @@
 """Reading of table columns: names, masked and missing values, units, numbers as text.
 
-Tables of stars come from everywhere: a missing value may be masked, NaN, empty, ``null`` or ``--``,
-a unit may be misspelled, a number may stand in a column of text.  All rooms read columns here.
+Tables of stars have many sources: a missing value may be masked, NaN, empty, ``null`` or ``--``, a
+unit may be misspelled, a number may be in a column of text.  All parts of the package read columns
+here.
 """
 
 import re
@@ -22,12 +23,12 @@ __all__ = [
     "unit_of",
 ]
 
-# What writers put where there is no value, in lower case.
+# Words for a missing value, in lower case.
 MISSING = ("", "null", "none", "nan", "na", "n/a", "--", "---", "-", "...", "\\n", "masked", "?")
 
 
 def spelled_names(names):
-    """Spelling of every name in lower case; an exact one goes before one in capitals.
+    """Return the spelling of every name by its lower case; an exact one has precedence.
 
     Parameters
     ----------
@@ -37,7 +38,7 @@ def spelled_names(names):
     Returns
     -------
     dict
-        Lower-case name, and every name itself, to the name as it is spelled.
+        Name as it is spelled, by itself and by its lower case.
     """
     return {n.lower(): n for n in reversed(names)} | {n: n for n in names}
 
@@ -48,14 +49,14 @@ def find_name(spelled, aliases):
     Parameters
     ----------
     spelled : dict
-        As `spelled_names` gives it.
+        As returned by `spelled_names`.
     aliases : sequence of str
         Names in lower case, best first.
 
     Returns
     -------
     str or None
-        The name as it is spelled, `None` if there is none.
+        The name as it is spelled; `None` if there is none.
     """
     return next((spelled[a] for a in aliases if a in spelled), None)
 
@@ -68,19 +69,19 @@ def listed(names, most=12):
     names : sequence of str
         Names of columns.
     most : int, optional
-        How many are shown.
+        Maximum number shown.
 
     Returns
     -------
     str
-        Names with commas between them.
+        Names separated by commas.
     """
     shown = ", ".join(names[:most])
     return f"{shown}, ... ({len(names)} columns)" if len(names) > most else shown
 
 
 def read_text(column):
-    """Return a column of text without blanks around it.
+    """Return a column as text without surrounding blanks.
 
     Parameters
     ----------
@@ -90,7 +91,7 @@ def read_text(column):
     Returns
     -------
     (N,) ndarray of str
-        An empty text where there is nothing or the value is masked.
+        Texts, empty for missing or masked values.
     """
     values, mask = _data_and_mask(column)
     if values.dtype.kind == "S":
@@ -111,19 +112,19 @@ def read_numbers(column, *, several=False):
     column : array_like
         Column of a table, masked or not, a Quantity, a list; numbers or text.
     several : bool, optional
-        Whether rows may have several values, of which the first is taken.
+        Whether rows may have several values, of which the first is used.
 
     Returns
     -------
     values : (N,) ndarray
-        NaN where a value is masked, missing, infinite or cannot be read.
+        Values, NaN if masked, missing, infinite or unreadable.
     unreadable : (N,) ndarray of bool
-        Where there is something that is no number.
+        Mask of cells that are not numbers.
 
     Raises
     ------
     ValueError
-        If no row has a number but some have something else, or rows have several values.
+        If no row has a number but some have something else, or if rows have several values.
     """
     values, mask = _data_and_mask(column)
     if values.ndim != 1:
@@ -151,7 +152,7 @@ def read_numbers(column, *, several=False):
 
 
 def numbers_or_none(table, name, rows=slice(None)):
-    """Give rows of a column as floats, or None where the table does not have it.
+    """Return rows of a column as floats, or None if the table does not have it.
 
     Parameters
     ----------
@@ -160,18 +161,18 @@ def numbers_or_none(table, name, rows=slice(None)):
     name : str
         Name of the column.
     rows : slice or array_like, optional
-        Rows; default all.
+        Rows; all by default.
 
     Returns
     -------
     ndarray or None
-        Values, NaN where there is none.
+        Values, NaN for missing ones.
     """
     return read_numbers(table[name])[0][rows] if name in table.colnames else None
 
 
 def numbers_or_nan(table, name):
-    """Return a column as floats, NaN where the table does not have it.
+    """Return a column as floats, NaN if the table does not have it.
 
     Parameters
     ----------
@@ -190,19 +191,19 @@ def numbers_or_nan(table, name):
 
 
 def unit_of(column, default=None):
-    """Return the unit of a column, also one that is not quite in the standard.
+    """Return the unit of a column, even if its spelling is nonstandard.
 
     Parameters
     ----------
     column : array_like
         Column of a table.
     default : unit, optional
-        Given where the column has none.
+        Unit for a column without one.
 
     Returns
     -------
     unit
-        A unit; an unrecognized one if nothing helps.
+        The unit, possibly unrecognized.
     """
     given = getattr(column, "unit", None)
     if given is None or given == u.dimensionless_unscaled or not str(given).strip():
@@ -220,12 +221,12 @@ def convert(values, given, unit):
     values : (N,) ndarray
         Numbers.
     given, unit : unit
-        Unit they are in, and unit wanted.
+        Unit of the numbers, and target unit.
 
     Returns
     -------
     (N,) ndarray
-        The same numbers if the units are the same.
+        Converted values; the same array if the units are the same.
 
     Raises
     ------
@@ -251,14 +252,14 @@ def _text(value):
 
 
 def _numbers_of_text(values):
-    """Numbers in text or objects, and where there is something else."""
+    """Numbers in text or objects, and a mask of other cells."""
     text = read_text(values)
     missing = np.isin(np.char.lower(text), MISSING)
     text = np.where(missing, "nan", text)
     try:
         return text.astype(float), np.zeros(len(text), bool)
     except ValueError:
-        # Text among the numbers is rare enough to be looked at cell by cell.
+        # Text among numbers is rare enough to be checked cell by cell.
         numbers = np.array([_number(t) for t in text.tolist()], dtype=float)
         return numbers, np.isnan(numbers) & (text != "nan")
 

@@ -2,7 +2,7 @@
 
 ::
 
-    any WCS --pixels to ICRS--> tangent plane --polynomial, table of what it leaves--> Calibration
+    any WCS --pixels to ICRS--> tangent plane --polynomial, table of the rest--> Calibration
 """
 
 import warnings
@@ -20,40 +20,40 @@ from wpdc_gwcs.solution import Calibration, DistortionSolution
 
 __all__ = ["fit_wcs"]
 
-# A polynomial this good (px) needs no table; with a table this good, no more nodes are needed.
+# A polynomial of this accuracy (px) needs no table; a table of this accuracy no more nodes.
 _ENOUGH_PX = 1e-4
 _TABLE_ENOUGH_PX = 5e-4
-# What is told to be so far off (px) is worth a warning.
+# A larger deviation than this (px) causes a warning.
 _TOLERANCE_PX = 1e-3
 _FIT_POINTS = 64
-# Nodes along each axis of the table, tried in turn.
+# Numbers of nodes along each axis of the table, tried in turn.
 _TABLE_NODES = (50, 99, 197, 393)
 
 
 def fit_wcs(wcs, *, image_shape=None, detector="detector", frame="converted"):
-    """Find the polynomial and the look-up table that are nearest to any celestial WCS.
+    """Fit a polynomial and a look-up table to any celestial WCS.
 
     Parameters
     ----------
     wcs : APE 14 WCS, or ``starlink.Ast.FrameSet``
-        From two pixel axes to the sky: a `gwcs.wcs.WCS` of whatever models, an `astropy.wcs.WCS`
-        with SIP, look-up tables or ``-TAB``, any other of the shared interface of Astropy; or a
-        frame set of AST from a grid to a sky frame.
+        WCS from two pixel axes to the sky: a `gwcs.wcs.WCS` of any models, an `astropy.wcs.WCS`
+        with SIP, look-up tables or ``-TAB``, any other WCS with the shared interface of Astropy, or
+        an AST frame set from a grid to a sky frame.
     image_shape : (int, int), optional
-        Shape of the image, (ny, nx); what the WCS knows by default.
+        Shape of the image, (ny, nx); by default that of the WCS.
     detector, frame : str, optional
         Names of the detector and of the frame.
 
     Returns
     -------
     calibration : Calibration
-        With the fast WCS; its ``statistics["conversion_deviation"]`` is the greatest distance from
-        ``wcs`` over the image, px.
+        Calibration with the fast WCS; ``statistics["conversion_deviation"]`` is the largest
+        deviation from ``wcs`` over the image, px.
 
     Raises
     ------
     TypeError
-        If it is no such WCS.
+        If it is not such a WCS.
     ValueError
         If the shape is unknown, the axes are not two of pixels and the sky, or the WCS has no value
         somewhere on the image.
@@ -65,10 +65,10 @@ def fit_wcs(wcs, *, image_shape=None, detector="detector", frame="converted"):
 
     Notes
     -----
-    The tangent point is the sky at the center of the image, or that of the WCS itself where it is a
-    tangential one of astropy.  The lowest degree up to 3 that is enough alone needs no table;
-    otherwise a cubic has one, of 50 x 50 nodes or more as needed.  Positions are taken to ICRS.
-    Where a bounding box is narrower than the image, the WCS is used beyond it.
+    The tangent point is the sky position of the center of the image, or that of the WCS itself if
+    it is a TAN WCS of astropy.  If a polynomial of degree 3 or lower is accurate enough, there is no
+    table; otherwise a cubic gets a table of 50 x 50 nodes, or more if needed.  Positions are
+    converted to ICRS.  If the bounding box is smaller than the image, the WCS is used beyond it.
 
     Examples
     --------
@@ -115,7 +115,7 @@ def fit_wcs(wcs, *, image_shape=None, detector="detector", frame="converted"):
 
 
 def _with_table(found, sky, calibration):
-    """Return a cubic the table of what it leaves, of as many nodes as it takes."""
+    """Return a cubic with a table of its residuals, with as many nodes as needed."""
     pv, (ny, nx) = found.solution.pv, found.solution.image_shape
     crpix, cd = (np.asarray(v) for v in (found.solution.crpix, found.cd))
     best = None
@@ -170,7 +170,7 @@ def _image_shape(wcs, image_shape):
 
 
 def _reference(wcs, sky, shape):
-    """Give reference pixel and tangent point: its own where polynomials stand about it."""
+    """Return reference pixel and tangent point: those of the WCS if its polynomials use them."""
     own = getattr(wcs, "wcs", None)
     if hasattr(own, "ctype") and all(c[4:].strip("-")[:3] in ("TAN", "TPV") for c in own.ctype):
         crpix = np.array(own.crpix, float) - 1.0
@@ -232,7 +232,7 @@ def _sky_of_ast(frames):
     lon = int(frames.get("LonAxis")) - 1
 
     def sky(x, y):
-        # AST counts from one, and puts radians on the axes in their own order.
+        # AST counts from one, uses radians, and has its own order of axes.
         world = np.degrees(frames.tran(np.array([x, y], float) + 1.0))
         return world[lon] % 360.0, world[1 - lon]
 

@@ -1,6 +1,6 @@
-"""Rows of a list that are one and the same star: lists stacked, cones that overlap.
+"""Rows of a list that are the same star, from stacked lists or overlapping cones.
 
-A star that stands twice in a list has two candidates in the other one, and is lost to a match.
+A star that occurs twice in a list is two candidates for its partner, and cannot be matched.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ _LEAST_COPIES, _LEAST_SHARE, _LEAST_SHARE_ALIKE = 10, 0.05, 0.02
 _SPREAD = 4.0
 # Differences of brightness, magnitudes: of one star in two bands, and of one star measured again.
 _MOST_APART, _ALIKE = 1.0, 0.1
-# Rows that are looked at next to each row, and the neighbor that tells how far stars are apart.
+# Number of neighbors examined per row, and neighbor whose distance gives the spacing of stars.
 _NEAR, _DISTANT = 6, 6
 # By chance, as many pairs are between a radius and 1.4 times as much as within it, along a line 0.4
 # of them: copies are closer together than that.
@@ -30,7 +30,7 @@ _ANNULUS, _CROWDING = 2**0.5, 3.5
 
 
 def group_copies(points, *, reach, errors=None, mag=None, links=None):
-    """Say which rows are the same star.
+    """Group rows that are the same star.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def group_copies(points, *, reach, errors=None, mag=None, links=None):
     mag : (N,) ndarray, optional
         Magnitudes; NaN where unknown.
     links : (i, j), optional
-        Rows that are known to be the same star two by two.
+        Pairs of rows that are known to be the same star.
 
     Returns
     -------
@@ -65,7 +65,7 @@ def group_copies(points, *, reach, errors=None, mag=None, links=None):
     first[place_of[::-1]] = np.arange(n - 1, -1, -1)
     edges = [(i, j), (np.arange(n), first[place_of])]
     if len(places) > 1:
-        # rows of one place go by the first of them
+        # rows at the same position are represented by the first one
         some = None if errors is None else np.asarray(errors, float)[first]
         brightness = None if mag is None else np.asarray(mag, float)[first]
         near = _near_pairs(places, reach, some, brightness)
@@ -76,7 +76,7 @@ def group_copies(points, *, reach, errors=None, mag=None, links=None):
 
 
 def _near_pairs(points, reach, errors, mag):
-    """Pairs of different places that are one star."""
+    """Pairs of different positions that are the same star."""
     n = len(points)
     tree = cKDTree(points)
     distant = tree.query(points, k=[min(_DISTANT, n - 1) + 1])[0][:, 0]

@@ -1,4 +1,4 @@
-"""Squares of pixels about sources, cut out of an image for many at once."""
+"""Square cutouts about many sources at once."""
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -7,7 +7,7 @@ __all__ = ["cut_squares", "on_image"]
 
 
 def cut_squares(image, xc, yc, half):
-    """Cut squares about integer centers; at the rim the outermost pixels are repeated.
+    """Cut squares about integer centers; at the edge, the outermost pixels are repeated.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def cut_squares(image, xc, yc, half):
     ny, nx = image.shape
     size = 2 * half + 1
     whole = (xc >= half) & (xc < nx - half) & (yc >= half) & (yc < ny - half)
-    # Rows of pixels are copied in one, where places of single pixels take several times as long.
+    # Whole rows are copied; indices of single pixels would take several times as long.
     if whole.all() and len(xc):
         return sliding_window_view(image, (size, size))[yc - half, xc - half]
     result = np.empty((len(xc), size, size), image.dtype)
@@ -62,7 +62,7 @@ def on_image(shape, xc, yc, half):
     Returns
     -------
     (N, n, n) ndarray of bool
-        True for those that are.
+        True for pixels on the image.
     """
     step = np.arange(-half, half + 1)
     iy, ix = yc[:, None] + step, xc[:, None] + step

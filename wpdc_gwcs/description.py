@@ -15,7 +15,7 @@ def describe(result):
     Parameters
     ----------
     result : Calibration, DistortionSolution, Camera or CalibrationRun
-        What is to be described.
+        The result.
 
     Returns
     -------
@@ -25,7 +25,7 @@ def describe(result):
     Raises
     ------
     TypeError
-        If it is something else.
+        If it is of another type.
 
     Examples
     --------
@@ -48,12 +48,12 @@ def describe(result):
 
 
 def as_html(result):
-    """Write a description as the table that a notebook shows.
+    """Format a description as an HTML table for notebooks.
 
     Parameters
     ----------
     result : object
-        What `describe` takes.
+        As for `describe`.
 
     Returns
     -------

@@ -6,7 +6,7 @@ __all__ = ["on_detector"]
 
 
 def on_detector(x, y, image_shape):
-    """Return which positions lie on a detector, its outer edges included.
+    """Mark positions on a detector, including its outer edges.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ class FrameError(InputError):
 
 
 class DuplicateFrameError(FrameError, ValueError):
-    """Two frames of one name, which would have the same files."""
+    """Two frames with the same name, whose files would be the same."""
 
 
 class CatalogError(InputError):
@@ -70,8 +70,8 @@ class MatchError(FrameFailure):
     message : str
         What is wrong.
     found : dict, optional
-        Of a match that is further from the header than is allowed: ``shift`` (px), ``rotation``
-        (deg) and ``scale`` (factor) from the header to it.
+        For a match that is further from the header than is allowed: ``shift`` (px), ``rotation``
+        (deg) and ``scale`` (factor) relative to the header.
     """
 
     def __init__(self, message="", *, found=None):
@@ -80,14 +80,14 @@ class MatchError(FrameFailure):
 
 
 class FitError(FrameFailure):
-    """Pairs that cannot determine what is fitted.
+    """Pairs that do not determine a fit.
 
     Parameters
     ----------
     message : str
         What is wrong.
     reasons : dict, optional
-        Name of each frame to its own reason, where several failed together.
+        Reason for each frame by name, if several failed together.
     """
 
     def __init__(self, message="", *, reasons=None):
@@ -128,13 +128,13 @@ def without_frames(error):
     Parameters
     ----------
     error : Exception
-        Its tracebacks, and those of what led to it, hold every array of the functions that it came
-        through: of an image, a hundred times what the frame needs.
+        The error.  Its tracebacks, and those of its causes, keep every array of the functions that
+        it came through alive: for an image, a hundred times what the frame needs.
 
     Returns
     -------
     Exception
-        The same.
+        The same error.
     """
     error.__traceback__ = error.__context__ = error.__cause__ = None
     return error

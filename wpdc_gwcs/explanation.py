@@ -1,9 +1,9 @@
-"""Why a frame is solved, degraded or refused: every stage of it, with counts.
+"""Explanation why a frame is solved, degraded or refused, stage by stage.
 
 ::
 
     frame --> sources --> catalog --> match --> solution
-              each a Stage: how it went, in words; the first that fails ends it
+              each is a Stage, described in words; the first one that fails is the last
 """
 
 import shlex
@@ -31,9 +31,9 @@ from wpdc_gwcs.extras import PLOT, missing
 
 __all__ = ["Explanation", "Stage", "explain_frame"]
 
-# Stars without which no match is tried, and those that make it easy.
+# Minimum number of stars for a match, and number that makes it easy.
 _FEW, _PLENTY = 8, 30
-# Scales that differ by more are the header's fault; a blind search finds less by itself.
+# A larger relative error of the scale is an error of the header; a blind search finds smaller ones.
 _SCALE_OFF = 0.03
 # Residuals this many times the errors are worth a word; stated errors are often half the true ones.
 _OVER_ERRORS = 4
@@ -46,11 +46,11 @@ class Stage:
     Parameters
     ----------
     name : str
-        What is done.
+        Name of the stage.
     went_well : bool
         Whether the next stage could begin.
     lines : tuple of str
-        What was found.
+        Results in words.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Explanation:
     advice : tuple of str
         What to try next.
     sources : `~astropy.table.Table` or None
-        What was measured.
+        Measured sources.
     usable : (N,) ndarray or None
         Mask over the sources.
     starts, references : (N, 2) ndarray or None
@@ -100,7 +100,7 @@ class Explanation:
 
 
 class _Story:
-    """What is known so far."""
+    """Collected results."""
 
     def __init__(self, frame, settings):
         self.frame, self.settings = frame, settings
@@ -128,14 +128,15 @@ def explain_frame(frame, catalog, settings=None):
     frame : Frame
         Image or source list.
     catalog : path-like, Table, SkyCoord, GaiaArchive or HatsCatalog
-        What `read_catalog` takes.
+        As for `read_catalog`.
     settings : Settings, optional
-        Choices, as for `calibrate`.
+        Settings, as for `calibrate`.
 
     Returns
     -------
     Explanation
-        Also if the frame fails; it is solved by itself, without others of its camera.
+        The explanation, even if the frame fails.  The frame is solved by itself, without others of
+        its camera.
 
     Raises
     ------
@@ -281,7 +282,7 @@ def _tell_solution(story, calibration):
             f"the residuals are {ratio:.0f} times the expected errors of the positions: check "
             "how these were measured (focus, trailed stars, errors in the list)"
         )
-    # What more stars would not mend has its own advice.
+    # A missing epoch has its own advice.
     if any("no epoch" not in reason for reason in reasons):
         story.advice.append(
             "solve it with dithered exposures of the same detector, with the other detectors of "
@@ -314,7 +315,7 @@ def _advise_on_sources(story, error):
 
 
 def _advise_on_match(story, stars, sources, error):
-    """Find out why nothing matched, or what would."""
+    """Find out why nothing matched, and what would."""
     n = int(np.sum(story.found["usable"]))
     if error.found is not None:
         _advise_on_header(story, stars, sources, error.found)
@@ -332,7 +333,7 @@ def _advise_on_match(story, stars, sources, error):
 
 
 def _advise_on_header(story, stars, sources, found):
-    """Say what the header should be, of a match that is further from it than is allowed."""
+    """Suggest a correction of the header for a match that is too far from it."""
     frame = story.frame
     scale = found["scale"] * linear_wcs(frame.wcs, header_reference_point(frame)).scale * 3600
     off = (
@@ -349,7 +350,7 @@ def _advise_on_header(story, stars, sources, found):
 
 
 def _try_otherwise(story, stars, sources, *, last=True):
-    """Find out which other choice would have matched the frame."""
+    """Find out which other option would match the frame."""
     name, settings = shlex.quote(story.frame.source), story.settings
     trials = {
         "--min-snr 3 --max-roundness 1": replace(settings, min_snr=3.0, max_roundness=1.0),

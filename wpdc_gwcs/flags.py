@@ -19,7 +19,7 @@ FLAG_EXTENDED = 16  # broader than the PSF: galaxy, or an unresolved blend
 FLAG_BAD_PIXEL = 32  # a masked pixel within the core
 FLAG_FIT_FAILED = 64  # the PSF does not fit: no star, or the windowed centroid was kept
 
-# What messages call them.
+# Names for messages.
 FLAG_NAMES = {
     FLAG_SATURATED: "saturated",
     FLAG_EDGE: "at the edge",

@@ -9,7 +9,7 @@ from wpdc_gwcs.frozen import freeze_attributes
 
 __all__ = ["Frame"]
 
-# What no file name, or no table, can hold: slash, line ends and the like, bytes that are not UTF-8.
+# Characters that file names or tables cannot contain: slash, control characters, invalid UTF-8.
 _UNFIT = re.compile(r"[/\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
@@ -31,7 +31,7 @@ class Frame:
     epoch : float, optional
         Mid-exposure epoch in Julian years; `None` if the header has no date.
     source : str
-        Where it came from, for messages: path and extension.
+        Origin of the frame for messages: path and extension.
     load_image : callable, optional
         Returns the image as a float array ``[y, x]``; called once, when needed.
     load_sources : callable, optional
@@ -40,7 +40,7 @@ class Frame:
     gain, saturation : float, optional
         Electrons per count and saturation level in counts, from the header.
     read_noise : float, optional
-        Of the detector, in electrons, from the header: the least that the noise of a pixel can be.
+        Read noise in electrons, from the header: the minimum noise of a pixel.
     exposure : str, optional
         Identifies the exposure among those of its camera: frames with the same camera and exposure
         were taken at the same time by the detectors of a mosaic.  `None`: a frame on its own.
@@ -49,18 +49,17 @@ class Frame:
     meta : dict
         Other facts of the header worth keeping (filter, exposure time, ...).
     load_mask, load_weight : callable, optional
-        Return what goes with the image: an array of bool, true where a pixel must not be used, and
-        one of weights, inverse variances of the sky of any scale.
+        Return the mask of the image (true for pixels that must not be used) and its weights
+        (inverse variances of the sky in any unit).
     inputs : tuple of str, optional
         Files besides that of ``source`` that the loaders read.
     fresh_image : bool, optional
-        Whether nobody else has the image that ``load_image`` returns: its memory is then used for
-        the work.
+        Whether the image from ``load_image`` may be overwritten, to save memory.
 
     Raises
     ------
     ValueError
-        If there is not exactly one loader, or the name, epoch, shape or a key is impossible.
+        If there is not exactly one loader, or the name, epoch, shape or a key is invalid.
 
     Examples
     --------

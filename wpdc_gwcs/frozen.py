@@ -1,4 +1,4 @@
-"""Values that cannot be changed: what results are made of."""
+"""Immutable values, of which results consist."""
 
 import copy
 
@@ -16,10 +16,10 @@ __all__ = [
 
 
 class FrozenDict(dict):
-    """A dictionary that cannot be changed; ``dict(d)`` and ``d | {...}`` give one that can.
+    """An immutable dictionary; ``dict(d)`` and ``d | {...}`` are mutable copies.
 
-    It is a `dict`, unlike `types.MappingProxyType`, so that it goes wherever one goes: through a
-    pickle to other processes, into JSON, into a copy.
+    Unlike `types.MappingProxyType` it is a `dict`, so that it can be pickled for other processes,
+    written as JSON, and copied.
     """
 
     def _refuse(self, *_, **__):
@@ -33,7 +33,7 @@ class FrozenDict(dict):
 
 
 class _FrozenParameter(Parameter):
-    """A parameter of a model that cannot be set; those of copies of the model can."""
+    """An immutable model parameter; those of copies of the model are mutable."""
 
     @property
     def value(self):
@@ -53,17 +53,17 @@ class _FrozenParameter(Parameter):
 
 
 def freeze(value):
-    """Return a value that cannot be changed, with all that is in it.
+    """Return a deeply immutable version of a value.
 
     Parameters
     ----------
     value : object
-        Dictionaries, lists, tuples and arrays within each other; all else is taken as it is.
+        Nested dictionaries, lists, tuples and arrays; other objects are kept as they are.
 
     Returns
     -------
     frozen : object
-        `FrozenDict`, tuple, or array that cannot be written to, of its own.
+        `FrozenDict`, tuple, or read-only copy of an array.
     """
     if isinstance(value, FrozenDict):
         return value
@@ -78,12 +78,12 @@ def freeze(value):
 
 
 def frozen_array(owner, name, *, shape=None, dtype=float, finite=True):
-    """Turn an attribute of a frozen object into an array of its own that cannot be written to.
+    """Replace an attribute of a frozen object by a read-only copy as an array.
 
     Parameters
     ----------
     owner : object
-        Frozen dataclass; an attribute that is `None` is left alone.
+        Frozen dataclass; an attribute that is `None` is kept.
     name : str
         Name of the attribute.
     shape : tuple of int or None, optional
@@ -133,14 +133,14 @@ def freeze_attributes(owner, *names):
 
 
 def freeze_models(owner, *names):
-    """Turn models among the attributes of a frozen dataclass into ones of its own that stay.
+    """Replace models among the attributes of a frozen dataclass by immutable copies.
 
     Parameters
     ----------
     owner : object
-        The dataclass; attributes that are `None` are left alone.
+        The dataclass; attributes that are `None` are kept.
     *names : str
-        Names of the attributes, models of astropy whose parameters are their own.
+        Names of the attributes, which are astropy models.
     """
     for name in names:
         model = getattr(owner, name)
@@ -153,20 +153,20 @@ def freeze_models(owner, *names):
 
 
 def with_statistics(result, **entries):
-    """Return the same result with more statistics.
+    """Return a copy of a result with more statistics.
 
     Parameters
     ----------
     result : dataclass instance
         Calibration or solution.
     **entries : object
-        To be added to its ``statistics``.
+        Entries to add to its ``statistics``.
 
     Returns
     -------
     result : dataclass instance
-        A new one; unlike that of `dataclasses.replace` it keeps the WCS that was built already,
-        which does not depend on statistics.
+        The copy; unlike with `dataclasses.replace`, a WCS that has been built is kept, because it
+        does not depend on statistics.
     """
     new = copy.copy(result)
     object.__setattr__(new, "statistics", freeze({**result.statistics, **entries}))

@@ -1,4 +1,4 @@
-"""One picture of a thing: of a solution, of stars, of a run, of a frame that is explained.
+"""Pictures of a solution, of stars, of a run, or of the explanation of a frame.
 
 Like `wpdc_gwcs.plotting`, every function returns a new `matplotlib.figure.Figure` and touches
 nothing else.
@@ -10,26 +10,26 @@ from wpdc_gwcs.columns import numbers_or_nan
 
 __all__ = ["draw_catalog", "draw_explanation", "draw_solution", "draw_sources", "draw_summary"]
 
-# Okabe and Ito's colors, told apart with any color vision.
+# Okabe and Ito's colors, distinguishable with any color vision.
 _BLUE, _ORANGE, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
 _STATES = {"solved": _BLUE, "degraded": "#E69F00", "failed": _ORANGE}
 _ARROWS = 15
 
 
 def draw_solution(solution, sigma=None):
-    """Draw the distortion of a detector, and how well it is known.
+    """Draw the distortion of a detector and its uncertainty.
 
     Parameters
     ----------
     solution : DistortionSolution
-        The detector.
+        Solution of the detector.
     sigma : (3, n, n) ndarray, optional
-        Uncertainty of a frame, in place of that of the solution.
+        Uncertainty of a frame instead of that of the solution.
 
     Returns
     -------
     `matplotlib.figure.Figure`
-        Arrows, and a map where the uncertainty is known.
+        Arrows, and a map of the uncertainty if it is known.
     """
     sigma = solution.table_sigma if sigma is None else sigma
     ny, nx = solution.image_shape
@@ -46,14 +46,14 @@ def draw_solution(solution, sigma=None):
 
 
 def draw_sources(sources, usable=None, image_shape=None):
-    """Draw where sources are on a detector, and which of them take part.
+    """Draw the positions of sources on a detector, and which of them are used.
 
     Parameters
     ----------
     sources : `~astropy.table.Table`
-        With ``x`` and ``y``.
+        Table with ``x`` and ``y``.
     usable : (N,) ndarray of bool, optional
-        Those that take part; default: those without flags.
+        Mask of the used ones; by default those without flags.
     image_shape : (int, int), optional
         Shape of the detector.
 
@@ -68,7 +68,7 @@ def draw_sources(sources, usable=None, image_shape=None):
 
 
 def draw_catalog(stars):
-    """Draw where the stars of a catalog are, and how many there are of each magnitude.
+    """Draw the positions of the stars of a catalog, and the number per magnitude.
 
     Parameters
     ----------
@@ -82,10 +82,10 @@ def draw_catalog(stars):
     """
     figure, (left, right) = _new_figure(2)
     ra, dec = (np.asarray(stars[name], float) for name in ("ra", "dec"))
-    # About the middle, so that RA 0 does not tear it apart.
+    # Relative to the center, so that RA 0 does not split the map.
     middle = np.degrees(np.angle(np.exp(1j * np.radians(ra)).mean())) % 360
     x = middle + (ra - middle + 180) % 360 - 180
-    # More would only make it black.
+    # More points would only make it black.
     step = max(1, len(x) // 20_000)
     left.plot(x[::step], dec[::step], ".", ms=2, color=_BLUE, alpha=0.6)
     left.invert_xaxis()
@@ -141,12 +141,12 @@ def draw_explanation(told):
     Parameters
     ----------
     told : Explanation
-        As `explain_frame` gives it.
+        As returned by `explain_frame`.
 
     Returns
     -------
     `matplotlib.figure.Figure`
-        Four panels; what a frame did not come to is left empty, with the reason.
+        Four panels; stages that the frame did not reach are empty, with the reason.
     """
     from matplotlib.figure import Figure
 
@@ -210,7 +210,7 @@ def _match(panel, told):
         step = np.column_stack(there) - here
         _arrows(panel, x, y, *step.T, told.frame.image_shape, f"{len(i)} pairs: header to catalog")
         return
-    # Where sources and stars are alike, one displacement is found more often than any other.
+    # If sources and stars are the same, one displacement is more frequent than others.
     starts = told.starts[np.isfinite(told.starts).all(axis=1)][:400]
     reach = 0.2 * max(told.frame.image_shape) + 500
     difference = (told.references[None, :, :] - starts[:, None, :]).reshape(-1, 2)

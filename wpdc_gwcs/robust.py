@@ -1,4 +1,4 @@
-"""Scatter that outliers do not move."""
+"""Robust estimates of scatter."""
 
 import numpy as np
 
@@ -9,14 +9,14 @@ _MAD_TO_SIGMA = 1.482602218505602
 
 
 def robust_scatter(values, *, axis=None):
-    """Scatter of values that outliers do not move: 1.4826 times the median absolute deviation.
+    """Return the robust scatter of values: 1.4826 times the median absolute deviation.
 
     Parameters
     ----------
     values : array_like
         Values in any unit; NaN are ignored.
     axis : int, optional
-        Axis along which it is taken; default all.
+        Axis along which it is computed; all by default.
 
     Returns
     -------
@@ -40,7 +40,7 @@ def robust_scatter(values, *, axis=None):
 
 
 def robust_sigma(values):
-    """Scatter about zero that outliers do not move: 1.4826 times the median absolute value.
+    """Return the robust scatter about zero: 1.4826 times the median absolute value.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def robust_sigma(values):
 
 
 def plane_scatter(dx, dy):
-    """Scatter per axis from the median length of two-dimensional residuals.
+    """Return the scatter per axis from the median length of two-dimensional residuals.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Which sources take part in a match: the one definition of a usable star."""
+"""Selection of the sources for a match: the definition of a usable star."""
 
 from functools import lru_cache
 
@@ -12,12 +12,12 @@ from wpdc_gwcs.flags import FLAG_NAMES
 
 __all__ = ["MAX_ROUNDNESS", "MIN_SNR", "judge_sources", "left_out", "select_sources"]
 
-# Stars kept (the paper's section 3.1): rounder than galaxies, and well measured.
+# Criteria for stars (section 3.1 of the paper): rounder than galaxies, and well measured.
 MAX_ROUNDNESS = 0.3
 MIN_SNR = 10.0
 
-# The stars' own roundness is that of their neighbors where there are enough of them, since optics
-# and turns of the field stretch stars differently over a detector; else of all.
+# The typical roundness is that of neighboring stars if there are enough, because optics and field
+# rotation stretch stars differently over a detector; else that of all stars.
 _NEIGHBORS = 40
 _MIN_LOCAL = 120
 # Sources whose roundness is more than noise, by signal-to-noise ratio; without any, all.
@@ -29,29 +29,29 @@ _N_SIGMA = 2.5
 
 
 def select_sources(sources, *, image_shape=None, max_roundness=MAX_ROUNDNESS, min_snr=MIN_SNR):
-    """Mark the sources that take part in a match: with a position, clean, round, bright enough.
+    """Mark the sources for a match: those with a position, clean, round and bright enough.
 
     Parameters
     ----------
     sources : `~astropy.table.Table`
         As for `match_sources`.
     image_shape : (int, int), optional
-        Shape ``(ny, nx)`` of the detector, where those beside it are to be left out.
+        Shape ``(ny, nx)`` of the detector, to leave out sources outside of it.
     max_roundness : float, optional
-        Greatest difference from the roundness that is typical of the frame's stars; beyond noise.
+        Largest difference from the typical roundness of the stars of the frame, beyond noise.
     min_snr : float, optional
-        Least signal-to-noise ratio.
+        Smallest signal-to-noise ratio.
 
     Returns
     -------
     (N,) ndarray of bool
-        True for those that take part.
+        True for selected sources.
 
     Notes
     -----
-    Round is what the stars of the frame are: the typical roundness is the most frequent one, of the
-    nearest stars where there are more than a hundred.  What is not known (NaN, or no such column)
-    leaves nothing out.
+    Roundness is relative to the stars of the frame: the typical roundness is the most frequent one,
+    among the nearest stars if there are more than a hundred.  Unknown values (NaN, or a missing
+    column) exclude nothing.
 
     Examples
     --------
@@ -69,22 +69,22 @@ def select_sources(sources, *, image_shape=None, max_roundness=MAX_ROUNDNESS, mi
 
 
 def judge_sources(sources, *, image_shape=None, max_roundness=MAX_ROUNDNESS, min_snr=MIN_SNR):
-    """Return which rule leaves out which sources.
+    """Return the sources that each rule excludes.
 
     Parameters
     ----------
     sources : `~astropy.table.Table` or mapping
-        As for `select_sources`; of a mapping, columns that are not there may be `None`.
+        As for `select_sources`; missing columns of a mapping may be `None`.
     image_shape : (int, int), optional
-        Shape ``(ny, nx)`` of the detector, where those beside it are to be left out.
+        Shape ``(ny, nx)`` of the detector, to leave out sources outside of it.
     max_roundness, min_snr : float, optional
         As for `select_sources`.
 
     Returns
     -------
     dict
-        What the sources are that a rule leaves out to an (N,) mask; a source that several would
-        leave out stands with the first.
+        An (N,) mask for each rule, by a description of the excluded sources; a source that breaks
+        several rules counts for the first one.
     """
     x, y = (_column(sources, name) for name in ("x", "y"))
     rules = {"without a position": ~(np.isfinite(x) & np.isfinite(y))}
@@ -117,7 +117,7 @@ def judge_sources(sources, *, image_shape=None, max_roundness=MAX_ROUNDNESS, min
 
 
 def left_out(rules):
-    """Count what each rule left out.
+    """Describe how many sources each rule excludes.
 
     Parameters
     ----------
@@ -147,12 +147,12 @@ def _column(sources, name):
     return None if column is None else read_numbers(column)[0]
 
 
-# Each stage asks for the same sources, and neighbors are slow to find.
+# Cached: every stage needs the same sources, and finding neighbors is slow.
 @lru_cache(maxsize=1)
 def _roundness_difference(x, y, roundness, snr, clean):
-    """Difference of the roundness from that of the stars of the frame or of its part, and scatter.
+    """Difference of the roundness from the typical one of the frame or its part, and scatter.
 
-    The scatter is that of bright stars about what is typical of them.  Columns come as bytes.
+    The scatter is that of bright stars about the typical value.  Columns are passed as bytes.
     """
     x, y, roundness, snr = (np.frombuffer(v) for v in (x, y, roundness, snr))
     clean = np.frombuffer(clean, bool)
@@ -161,11 +161,11 @@ def _roundness_difference(x, y, roundness, snr, clean):
     known = bright if bright.sum() >= _MIN_ROUND else known
     rows = np.flatnonzero(known)
     if len(rows) < _MIN_ROUND:
-        # Of a handful the middle one is as good a guess as any.
+        # For a handful of stars, the median is as good as anything.
         return roundness - (np.median(roundness[rows]) if len(rows) > 2 else 0.0), 0.0
     typical = np.full(len(x), _crowded_half(roundness[rows])[0])
     if len(rows) >= _MIN_LOCAL:
-        # Those that another rule leaves out need no judgment by this one.
+        # Sources that another rule excludes need not be judged.
         placed = np.flatnonzero(clean & np.isfinite(x) & np.isfinite(y))
         tree = KDTree(np.column_stack([x[rows], y[rows]]))
         _, near = tree.query(np.column_stack([x[placed], y[placed]]), k=_NEIGHBORS)
@@ -175,7 +175,7 @@ def _roundness_difference(x, y, roundness, snr, clean):
 
 
 def _crowded_half(values):
-    """Middle and scatter of the shortest half of the values: what stars have in common."""
+    """Center and scatter of the shortest half of the values: the value typical of stars."""
     values = np.sort(values)
     n = (len(values) + 1) // 2
     width = values[n - 1 :] - values[: len(values) - n + 1]

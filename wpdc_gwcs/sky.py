@@ -1,4 +1,4 @@
-"""The sky in arrays of plain degrees: directions, motions in space, parallax."""
+"""Positions on the sky in plain degrees: directions, motions in space, parallax."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ __all__ = [
 
 
 def directions(ra, dec):
-    """Give unit vectors toward stars, East and North of them.
+    """Return the unit vectors toward stars, and east and north of them.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def angles(vector):
     Parameters
     ----------
     vector : (3, N) array_like
-        Of any length.
+        Vectors of any length.
 
     Returns
     -------
@@ -52,7 +52,7 @@ def angles(vector):
 
 
 def move(ra, dec, pmra, pmdec, years, *, radial=0.0):
-    """Move stars straight on in space.
+    """Move stars linearly in space.
 
     Parameters
     ----------
@@ -61,16 +61,16 @@ def move(ra, dec, pmra, pmdec, years, *, radial=0.0):
     pmra, pmdec : (N,) ndarray
         Proper motions, mas / yr; that in right ascension includes cos Dec.
     years : (N,) ndarray or float
-        How long, yr.
+        Time, yr.
     radial : (N,) ndarray or float, optional
-        Radial velocity over distance, mas / yr: as `radial_motion` gives it.
+        Radial velocity over distance, mas / yr, as from `radial_motion`.
 
     Returns
     -------
     ra, dec : (N,) ndarray
         Positions, deg.
     pmra, pmdec : (N,) ndarray
-        The motion as it is seen then, mas / yr: moving on or back starts from there.
+        Proper motions at the new time, mas / yr, from which stars can be moved further.
     """
     r, east, north = directions(ra, dec)
     mas = np.pi / 180.0 / 3.6e6
@@ -90,7 +90,7 @@ def move(ra, dec, pmra, pmdec, years, *, radial=0.0):
 
 
 def radial_motion(velocity, parallax):
-    """Radial velocity as a motion, in the unit of proper motions.
+    """Convert radial velocities to the unit of proper motions.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def radial_motion(velocity, parallax):
     Returns
     -------
     (N,) ndarray
-        Share of the distance covered in a year, mas / yr; zero where one of the two is not known.
+        Radial velocity over distance, mas / yr; zero if either is unknown.
     """
     # 1 au / yr is 4.740470446 km / s: over a parallax in mas this is mas / yr.
     return np.nan_to_num(np.asarray(velocity) * np.maximum(parallax, 0.0) / 4.740470446)
@@ -125,7 +125,7 @@ def annual_parallax(ra, dec, parallax, epoch):
     ra, dec : (N,) ndarray
         Apparent positions, deg.
     """
-    # erfa's Earth needs no ephemeris file, hence no network.
+    # The Earth of erfa needs no ephemeris file and no network.
     import erfa
 
     barycentric = erfa.epv00(2451545.0, (epoch - 2000.0) * 365.25)[1]["p"]

@@ -22,9 +22,9 @@ from wpdc_gwcs.wcs import build_wcs
 
 __all__ = ["Calibration", "DistortionSolution"]
 
-# A reference point further off than this, px, is no number of any camera.
+# No camera has a reference point further away than this, px.
 FARTHEST_PX = 1e9
-# Scales of the two axes differ by less than this factor, or the matrix has no inverse worth having.
+# If the scales along its axes differ by more than this factor, a matrix has no useful inverse.
 _MOST_CONDITION = 1e6
 
 
@@ -39,14 +39,14 @@ def has_inverse(matrix):
     Returns
     -------
     bool
-        Whether its scales along its own axes differ by less than a million.
+        True if its scales along its own axes differ by less than a factor of a million.
     """
     matrix = np.asarray(matrix, dtype=float)
     return bool(np.isfinite(matrix).all() and np.linalg.cond(matrix) < _MOST_CONDITION)
 
 
 def _freeze_pointing(owner):
-    """Freeze CRVAL and CD, and make sure that they are a place and a linear map."""
+    """Freeze CRVAL and CD, and check that they are a position and a linear map."""
     crval = frozen_array(owner, "crval", shape=(2,))
     if not (abs(crval[0]) <= 360 and abs(crval[1]) <= 90):
         raise ValueError(f"crval must be RA and Dec within 360 and 90 deg, got {crval.tolist()}")
@@ -83,12 +83,12 @@ class DistortionSolution(InMemory):
         Table of the residuals of the polynomial.
     table_sigma : (3, n, n) ndarray, optional
         sigma_x, sigma_y in px and their correlation on a grid from one outer edge of the detector
-        to the other, of polynomial and table together, without the linear part that the attitudes
-        carry.
+        to the other, of polynomial and table together, without the linear part that attitudes
+        absorb.
     residual_map : ResidualMap, optional
         Binned residuals of the table, to which those of other frames can be added.
     statistics, settings, provenance : dict
-        How the solution was made; they and their contents cannot be changed.
+        How the solution was made; immutable.
     valid_from, valid_to : float, optional
         Epochs (Julian years) from which, and until which, the solution is valid; `None` if there is
         no known limit.
@@ -130,7 +130,7 @@ class DistortionSolution(InMemory):
                 raise ValueError(f"{name} must be a Julian year or None, got {epoch}")
 
     def __setstate__(self, state):
-        # Copies of models can be changed, those in copies of results cannot.
+        # Copies of models are mutable, but not those in copies of results.
         self.__dict__.update(state)
         freeze_models(self, "pv", "lookup_table")
 
@@ -150,7 +150,7 @@ class DistortionSolution(InMemory):
         Returns
         -------
         bool
-            From ``valid_from`` on and before ``valid_to``.
+            True from ``valid_from`` on and before ``valid_to``.
         """
         if epoch is None:
             return True
@@ -180,7 +180,7 @@ class DistortionSolution(InMemory):
         )
 
     def undistort(self, x, y):
-        """Take the distortion off detector pixels.
+        """Remove the distortion from detector pixels.
 
         Parameters
         ----------
@@ -206,7 +206,7 @@ class DistortionSolution(InMemory):
         return float(area.min()), float(area.max())
 
     def covariance(self, x, y):
-        """Covariance of the distortion of the detector, without its linear part.
+        """Return the covariance of the distortion, without its linear part.
 
         Parameters
         ----------
@@ -216,8 +216,8 @@ class DistortionSolution(InMemory):
         Returns
         -------
         (2, 2, ...) ndarray
-            Covariance of the undistorted position in px^2; NaN off the detector, and everywhere
-            where the solution holds no covariances.
+            Covariance of the undistorted position in px^2; NaN outside the detector, and everywhere
+            if the solution has no covariances.
         """
         x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
         return _covariance(self.table_sigma, self.image_shape, x, y)
@@ -235,7 +235,7 @@ def _covariance(sigma, image_shape, x, y):
 
 
 def covariance_of(sigma):
-    """Covariance matrices of standard deviations and correlations.
+    """Return covariance matrices for standard deviations and correlations.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def covariance_of(sigma):
     Returns
     -------
     (2, 2, ...) ndarray
-        Squares of their unit.
+        Covariances, in the squared unit.
     """
     sigma_x, sigma_y, rho = sigma
     cross = rho * sigma_x * sigma_y
@@ -288,7 +288,7 @@ class Calibration(InMemory):
     matches, sources : `~astropy.table.Table`, optional
         Pairs and sources of the frame, with units.
     statistics, settings, provenance : dict
-        How the calibration was made; they and their contents cannot be changed.
+        How the calibration was made; immutable.
     """
 
     frame: str
@@ -318,7 +318,7 @@ class Calibration(InMemory):
         return as_html(self)
 
     def __getstate__(self):
-        # Functions of compiled code stay where they are; they are made again where they are needed.
+        # Compiled functions are not pickled; they are created again when needed.
         return {name: value for name, value in self.__dict__.items() if name != "_functions"}
 
     def __setstate__(self, state):
@@ -344,8 +344,8 @@ class Calibration(InMemory):
 
     @cached_property
     def _functions(self):
-        """Both ways between detector and sky, as functions of blocks of points."""
-        # Not those of the WCS, which can be changed: these need not look whether it was.
+        """Functions from detector to sky and back, for blocks of points."""
+        # Independent of the WCS, which is mutable, so no check for changes is needed.
         wcs = self._build_wcs()
         box = wcs.bounding_box
         box = None if box is None else box.bounding_box(order="F")
@@ -358,16 +358,16 @@ class Calibration(InMemory):
         Parameters
         ----------
         x, y : array_like or `~astropy.units.Quantity`
-            Detector pixels, zero based; of any shapes that fit each other.
+            Detector pixels, zero based; of any shapes that broadcast.
 
         Returns
         -------
         ra, dec : float or ndarray
-            Positions in degrees, NaN off the detector; masked where an input is.
+            Positions in degrees, NaN outside the detector; masked where an input is.
 
         See Also
         --------
-        sky_to_pixel : The way back.
+        sky_to_pixel : The inverse.
         """
         return _evaluate(self._functions[0], x, y, u.pix)
 
@@ -377,25 +377,25 @@ class Calibration(InMemory):
         Parameters
         ----------
         ra, dec : array_like or `~astropy.units.Quantity`
-            Positions in degrees, or with a unit of their own.
+            Positions in degrees, or with a unit.
 
         Returns
         -------
         x, y : float or ndarray
-            Detector pixels, zero based, NaN off the detector; masked where an input is.
+            Detector pixels, zero based, NaN outside the detector; masked where an input is.
 
         See Also
         --------
-        pixel_to_sky : The way to the sky.
+        pixel_to_sky : The inverse.
         """
         return _evaluate(self._functions[1], ra, dec, u.deg)
 
     @cached_property
     def lookup_table(self):
-        """Table of the instrument and field of the exposure together, or `None`.
+        """Sum of the table of the instrument and the field of the exposure, or `None`.
 
-        Splines on the nodes of the finer of the two; the field is much smoother than its nodes are
-        apart.
+        A spline on the finer nodes of the two; the field is much smoother than the spacing of its
+        nodes.
         """
         tables = [t for t in (self.solution.lookup_table, self.field) if t is not None]
         if len(tables) < 2:
@@ -422,7 +422,7 @@ class Calibration(InMemory):
         return self.wcs.get_transform("detector", "undistorted")(x, y)
 
     def at_color(self, color):
-        """Calibration of the same frame for stars of another color.
+        """Return the calibration of the frame for stars of another color.
 
         Parameters
         ----------
@@ -432,7 +432,7 @@ class Calibration(InMemory):
         Returns
         -------
         Calibration
-            With another CRVAL and CD; the same if the frame shows no dependence on color.
+            Calibration with another CRVAL and CD; the same one if there is no dependence on color.
 
         Raises
         ------
@@ -453,7 +453,7 @@ class Calibration(InMemory):
         )
 
     def uncertainty(self, x, y):
-        """Uncertainty of the WCS at a detector position, without centroid errors.
+        """Return the uncertainty of the WCS at a position, without centroid errors.
 
         Parameters
         ----------
@@ -464,7 +464,7 @@ class Calibration(InMemory):
         -------
         sigma_x, sigma_y : ndarray
             Standard deviations of the undistorted position along the detector's axes, px; NaN off
-            the detector, and everywhere where the covariances are not known.
+            the detector, and everywhere if the covariances are unknown.
         rho : ndarray
             Correlation of the two errors.
 

@@ -1,4 +1,4 @@
-"""Names of what is being done, for those who wait: told by the stages, heard by who asks."""
+"""Announcement of the current stage of the work, for progress displays."""
 
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -9,12 +9,12 @@ _listener = ContextVar("listener", default=None)
 
 
 def announce(stage):
-    """Tell that a stage begins.
+    """Announce that a stage begins.
 
     Parameters
     ----------
     stage : str
-        Its name, a word.
+        Name of the stage, one word.
     """
     listener = _listener.get()
     if listener is not None:
@@ -23,7 +23,7 @@ def announce(stage):
 
 @contextmanager
 def listening(listener):
-    """Hear what is announced within a block, in this thread.
+    """Listen to announcements within a block, in this thread.
 
     Parameters
     ----------

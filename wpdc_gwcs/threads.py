@@ -1,10 +1,10 @@
-"""Threads of the linear algebra library, and how to do without them."""
+"""Restriction of the linear algebra library to one thread."""
 
 from threadpoolctl import threadpool_limits
 
 __all__ = ["one_blas_thread"]
 
-#: Decorator: while the function runs, linear algebra keeps to one thread.  Matrices here are small
-#: and many; threads gain little on an idle machine, and wait for each other for several times the
-#: work itself, up to a thousand times, on a busy one.
+#: Decorator: while the function runs, linear algebra uses one thread.  The matrices are small and
+#: many: threads gain little on an idle machine, and on a busy one they wait for each other several
+#: (up to a thousand) times as long as the work takes.
 one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")

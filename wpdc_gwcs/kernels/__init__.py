@@ -1,9 +1,9 @@
-"""The inner loops: compiled where there was a compiler, the same in NumPy elsewhere.
+"""The inner loops: compiled if there was a compiler, otherwise the same in NumPy.
 
-`implementation` says which of the two is at work, ``"compiled"`` or ``"numpy"``; this module is the
-only one that knows.  The environment variable ``WPDC_GWCS_KERNELS=numpy`` asks for NumPy.  Both do
-the same; those of the WCS do the same operations in the same order, so that their results have the
-same bits, those of stars agree to rounding.
+`implementation` is the name of the one in use, ``"compiled"`` or ``"numpy"``.  The environment
+variable ``WPDC_GWCS_KERNELS=numpy`` selects NumPy.  The kernels of the WCS do the same
+operations in the same order, so that their results are identical to the last bit; those of stars
+agree to rounding.
 """
 
 import os

@@ -1,7 +1,7 @@
 """The kernels of the WCS in NumPy, for installations without a compiler.
 
-Operation by operation the same as the C sources beside it, so that the results have the same bits.
-Whoever changes one changes the other; the tests compare them.
+They repeat the C sources operation by operation, so that the results are identical to the last bit.
+A change of one needs the same change of the other; the tests compare them.
 """
 
 import math
@@ -31,7 +31,7 @@ CELL_ORDER = "qkjip"
 _RADIAN = np.pi / 180
 _DEGREE = 180 / np.pi
 
-# Angles beyond it, degrees, are no coordinates.
+# Larger angles, degrees, are not coordinates.
 _GREATEST_ANGLE = 1e9
 
 _MAX_NEWTON = 25
@@ -76,10 +76,10 @@ _ARC_TANGENT = (
 
 
 class _Scratch(threading.local):
-    """Work space that each thread keeps from block to block.
+    """Work space that each thread reuses from block to block.
 
-    Arrays of this size would otherwise be mapped and unmapped by the system for every block, which
-    takes longer than filling them.
+    Otherwise the system would map and unmap arrays of this size for every block, which takes longer
+    than filling them.
     """
 
     space = np.empty(0)
@@ -110,7 +110,7 @@ def _series(coefficients, z):
 def _sin_cos(angle):
     """Return sine and cosine of angles in degrees."""
     angle = np.where(np.abs(angle) <= _GREATEST_ANGLE, angle, np.nan)
-    # Quarters of a turn are taken off in degrees, where they are exact.
+    # Quarter turns are subtracted in degrees, where they are exact.
     quarters = np.rint(angle * (1.0 / 90.0))
     x = angle - quarters * 90.0
     x *= _RADIAN
@@ -412,13 +412,13 @@ def to_sky(plane, cells, tangent, box, x, y, ra, dec):
     Parameters
     ----------
     plane : Plane
-        To the tangent plane in radians.
+        Map to the tangent plane in radians.
     cells : Plane or None
-        To the sky itself in degrees, for what lies inside its cells.
+        Map to the sky itself in degrees, for points inside its cells.
     tangent : (9,) ndarray
         Tangent point, see `tangent_numbers`.
     box : (5,) ndarray or None
-        Smallest and largest x, smallest and largest y, and what points outside become.
+        Smallest and largest x, smallest and largest y, and value of points outside.
     x, y : (N,) ndarray
         Pixels.
     ra, dec : (N,) ndarray
@@ -453,9 +453,9 @@ def rows_to_sky(plane, cells, tangent, x, y, ra, dec):
     Parameters
     ----------
     plane : Plane
-        To the tangent plane in radians.
+        Map to the tangent plane in radians.
     cells : Plane or None
-        To the sky itself in degrees, if all pixels lie inside its cells.
+        Map to the sky itself in degrees, if all pixels are inside its cells.
     tangent : (9,) ndarray
         Tangent point, see `tangent_numbers`.
     x, y : (N,), (M,) ndarray
@@ -556,14 +556,15 @@ def invert(plane, start, limits, tangent, box, a, b, x, y):
     plane : Plane
         The map.
     start : Plane or None
-        An approximate inverse, where to start; the images themselves for `None`.
+        Approximate inverse for the starting points; the images themselves for `None`.
     limits : (4,) ndarray
-        Greatest residual, bound of the second derivatives inside the cells, sign of the Jacobian
-        determinant in the middle, and how far outside the box answers are put on its rim.
+        Largest residual, bound of the second derivatives inside the cells, sign of the Jacobian
+        determinant in the middle, and distance outside the box within which solutions are moved to
+        its edge.
     tangent : (9,) ndarray or None
         If given, a and b are positions on the sky, see `from_sky`.
     box : (5,) ndarray or None
-        Smallest and largest x, smallest and largest y, and what answers outside become.
+        Smallest and largest x, smallest and largest y, and value of solutions outside.
     a, b : (N,) ndarray
         Images to invert.
     x, y : (N,) ndarray
@@ -592,7 +593,7 @@ def _solve_near_and_far(plane, start, limits, a, b, index, x_out, y_out):
     x, y = a, b
     if start is not None:
         if start.table.size:
-            # Held at the edge: what lies farther out has no answer anyway.
+            # Held at the edge: points farther out have no solution anyway.
             x, y = _hold(a, *start.head[:2]), _hold(b, *start.head[3:5])
         x, y = _values(start, x, y)
     if plane.table.size:
@@ -611,7 +612,7 @@ def _hold_near(plane, x, y):
 
 
 def _solve(plane, limits, a, b, x, y, index, x_out, y_out, *, bounded):
-    """Newton's method from x, y on; what has no answer keeps the NaN of the outputs."""
+    """Newton's method from x, y; points without a solution keep the NaN of the outputs."""
     tolerance, curvature, sign = limits[:3]
     for _ in range(_MAX_NEWTON):
         if not len(a):
@@ -624,12 +625,12 @@ def _solve(plane, limits, a, b, x, y, index, x_out, y_out, *, bounded):
         dy = (a_x * left_b - b_x * left_a) / determinant
         x_new, y_new = x + dx, y + dy
         determinant *= sign
-        # What a step leaves is bounded by its length.
+        # The remaining error of a step is bounded by its length.
         residual = (dx * dx + dy * dy) * (0.5 * curvature)
         certain = residual <= tolerance
         certain &= _in_cells(plane.head, x_new, y_new)
         if not certain.all():
-            # The bound is not good enough, so the map itself has to say.
+            # The bound is not tight enough: evaluate the map.
             unsure = ~certain
             x_unsure, y_unsure = x_new[unsure], y_new[unsure]
             if bounded:
@@ -637,12 +638,12 @@ def _solve(plane, limits, a, b, x, y, index, x_out, y_out, *, bounded):
                 x_new[unsure], y_new[unsure] = x_unsure, y_unsure
             left_a, left_b = _values(plane, x_unsure, y_unsure)
             residual[unsure] = np.maximum(np.abs(a[unsure] - left_a), np.abs(b[unsure] - left_b))
-        # Rounding of the map sets the floor.
+        # Rounding errors of the map set the limit.
         limit = tolerance + 16 * np.finfo(float).eps * np.maximum(np.abs(a), np.abs(b))
         done = residual <= limit
         answer = done & (determinant > 0)
         x_out[index[answer]], y_out[index[answer]] = x_new[answer], y_new[answer]
-        # A point that no longer moves, or left for infinity, has no answer.
+        # A point that no longer moves, or has diverged, has no solution.
         going = (x_new != x) | (y_new != y)
         going &= np.isfinite(x_new) & np.isfinite(y_new)
         going &= ~done

@@ -1,4 +1,4 @@
-"""What kernels work on, as plain arrays of numbers: a map of the plane, and a tangent point."""
+"""Input of the kernels as plain arrays: a map of the plane, and a tangent point."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ _ALIGNMENT = 64
 class Plane(NamedTuple):
     """A map of the plane: polynomial, radial terms and bicubic cells, summed.
 
-    A part that is not there is empty.
+    A missing part is empty.
 
     Parameters
     ----------
@@ -44,12 +44,12 @@ def arrange(coefficients, order):
     coefficients : (2, 4, 4, ny + 2, nx + 2) ndarray
         ``coefficients[k, p, q, j, i]`` multiplies ``s**p t**q`` in output k in cell (j, i).
     order : str
-        The same five letters in the order that the kernels have them in, ``CELL_ORDER``.
+        The same five letters in the order of the kernels, ``CELL_ORDER``.
 
     Returns
     -------
     table : (...) ndarray
-        Contiguous in that order.
+        Array, contiguous in this order.
     """
     ordered = coefficients.transpose(["kpqji".index(letter) for letter in order])
     space = np.empty(ordered.size * 8 + _ALIGNMENT, dtype=np.uint8)
@@ -65,9 +65,9 @@ def arranged(table, order):
     Parameters
     ----------
     table : (...) ndarray
-        What `arrange` returned.
+        As returned by `arrange`.
     order : str
-        The order that it was given.
+        Its order.
 
     Returns
     -------
@@ -78,14 +78,14 @@ def arranged(table, order):
 
 
 def tangent_numbers(crval, matrix=((1.0, 0.0), (0.0, 1.0)), offset=(0.0, 0.0)):
-    """Return a tangent point and what leads from the plane to pixels, for kernels.
+    """Return a tangent point and the map from the plane to pixels, for kernels.
 
     Parameters
     ----------
     crval : (float, float)
         Tangent point, RA and Dec in degrees.
     matrix : (2, 2) array_like, optional
-        From standard coordinates in degrees to pixels.
+        Matrix from standard coordinates in degrees to pixels.
     offset : (float, float), optional
         Pixel of the tangent point.
 

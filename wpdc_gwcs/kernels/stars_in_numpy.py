@@ -1,15 +1,15 @@
 """The kernels of stars in NumPy, for installations without a compiler.
 
 A point-spread function is a sum of few grids of coefficients of cubic B-splines.  All pixels of a
-star fall onto the same phase of the grid, so 4 x 4 weights and the shares of the grids are all that
-a star has of its own.
+star have the same phase in the grid, so each star has only 4 x 4 weights and the shares of the
+grids.
 """
 
 import numpy as np
 
 __all__ = ["paint_stars", "star_profiles", "star_steps"]
 
-# Pixels of stars that are worked on at a time: bounds the memory.
+# Number of pixels of stars processed at once, to limit the memory.
 _CHUNK = 400_000
 
 
@@ -23,8 +23,8 @@ def star_profiles(grids, oversampling, phase, shares, half, profiles):
     oversampling : int
         Knots per pixel.
     phase : (N, 18) ndarray
-        Of each star: the knot below its central pixel along x, the weights of the knots from one
-        before that to two after it, the derivatives of these by the position in knots; the same
+        For each star: the knot below its central pixel along x, the weights of the knots from one
+        before it to two after it, the derivatives of these by the position in knots; the same
         along y.
     shares : (N, R) ndarray
         Shares of the grids.
@@ -44,7 +44,7 @@ def star_profiles(grids, oversampling, phase, shares, half, profiles):
     outer = outer.reshape(len(outer), len(phase), 16 * shares.shape[1])
     margin = oversampling * (2 * half + 2) + 8
     padded = np.pad(grids, ((0, 0), (margin, margin), (margin, margin)))
-    # Stars that ran far away see nothing but the padding.
+    # Stars that have moved far away see only the padding.
     limit = margin - oversampling * half - 4
     lowest, highest = -limit, grids.shape[-1] + limit
     base_x, base_y = (
@@ -112,9 +112,9 @@ def star_steps(profiles, flux, pixels, use, variance, photons, noise, step, cova
     flux : (N,) ndarray
         Fluxes.
     pixels : (N, n) ndarray
-        What was measured.
+        Measured values.
     use : (N, n) bool ndarray
-        Which pixels to use.
+        Pixels to use.
     variance : (N, n) ndarray
         Variance without the star.
     photons : (N, n) ndarray or None
@@ -124,7 +124,7 @@ def star_steps(profiles, flux, pixels, use, variance, photons, noise, step, cova
     step : (N, 3) ndarray
         Steps of x, y and flux are written here; zero where the equations are singular.
     covariance : (N, 3, 3) ndarray
-        Their covariance; NaN there.
+        Covariance of the steps; NaN there.
     chi2 : (N,) ndarray
         Chi square per degree of freedom.
     """

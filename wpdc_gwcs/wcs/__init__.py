@@ -1,4 +1,4 @@
-"""Models to a `gwcs.WCS`, and the same in stock astropy models.
+"""A `gwcs.WCS` from the models of this package, and the same in stock astropy models.
 
 ::
 

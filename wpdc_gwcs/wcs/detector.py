@@ -1,4 +1,4 @@
-"""Our models as a `gwcs.WCS` of a detector, with fast calls and a bounding box that masks."""
+"""A `gwcs.WCS` of a detector with fast calls and masking by the bounding box."""
 
 import numpy as np
 from astropy import coordinates as coord
@@ -27,16 +27,16 @@ __all__ = ["DetectorWCS", "build_wcs", "pipeline_steps"]
 class DetectorWCS(WCS):
     """A `gwcs.WCS` of a detector whose inverse decides validity by pixels.
 
-    It differs from its base class in these points only:
+    It differs from its base class only in these points:
 
     - `invert` (and with it ``world_to_pixel``) does not mask positions by the range of right
-      ascension and declination of the detector's corners, which loses good points wherever the
-      image of the detector is not a rectangle on the sky, up to all of them at a pole.  Every
-      answer comes from an exact inverse; those that lie outside the bounding box are masked, both
-      coordinates together, and answers within 1e-6 px of the rim count as on it.
+      ascension and declination of the detector's corners, which would lose good points if
+      the detector is not a rectangle in these coordinates, and all of them at a pole.  Every
+      solution comes from an exact inverse; solutions outside the bounding box are masked in both
+      coordinates, and those within 1e-6 px of its edge count as inside.
     - The two steps and the bounding box are evaluated in one pass.
 
-    All else, including the parameters, is that of the base class.
+    Everything else, including the parameters, is as in the base class.
     """
 
     def _models(self):
@@ -81,9 +81,9 @@ class DetectorWCS(WCS):
         with_bounding_box : bool, optional
             Whether points outside the bounding box are set to ``fill_value``.
         fill_value : float, optional
-            What they become.
+            Value for these points.
         **kwargs
-            Passed on to the transform.
+            Passed to the transform.
 
         Returns
         -------
@@ -110,9 +110,9 @@ class DetectorWCS(WCS):
         with_bounding_box : bool, optional
             Whether points outside the bounding box are set to ``fill_value``.
         fill_value : float, optional
-            What both coordinates become, there and where there is no answer.
+            Value of both coordinates for these points, and if there is no solution.
         **kwargs
-            Passed on to the base class.
+            Passed to the base class.
 
         Returns
         -------
@@ -131,11 +131,11 @@ class DetectorWCS(WCS):
 
     @property
     def _has_our_inverse(self):
-        """Whether the way back is exact, so that pixels can tell what is outside."""
+        """Whether the inverse is exact, so that pixels decide what is outside."""
         return any(isinstance(step.transform, DistortionCorrection) for step in self.pipeline)
 
     def outside_footprint(self, world_arrays):
-        """Return the positions as they are: the inverse itself tells what is outside.
+        """Return the positions unchanged: the inverse itself decides what is outside.
 
         Parameters
         ----------
@@ -145,8 +145,8 @@ class DetectorWCS(WCS):
         Returns
         -------
         world_arrays : sequence of array_like
-            The same; for pipelines without a `~wpdc_gwcs.models.DistortionCorrection` what gwcs
-            makes of them.
+            The same; for pipelines without a `~wpdc_gwcs.models.DistortionCorrection`, the result
+            of gwcs.
         """
         if not self._has_our_inverse:
             return super().outside_footprint(world_arrays)
@@ -165,8 +165,8 @@ class DetectorWCS(WCS):
         Returns
         -------
         pixel_arrays : tuple of array_like
-            Pixel coordinates; those within 1e-6 px outside the rim are put on it.  For pipelines
-            without a `~wpdc_gwcs.models.DistortionCorrection` what gwcs makes of them.
+            Pixel coordinates; those up to 1e-6 px outside are moved to the edge.  For pipelines
+            without a `~wpdc_gwcs.models.DistortionCorrection`, the result of gwcs.
         """
         if not self._has_our_inverse:
             return super().out_of_bounds(pixel_arrays, fill_value=fill_value)
@@ -192,7 +192,7 @@ class DetectorWCS(WCS):
         return tuple(values)
 
 
-# `str` and `repr` of a WCS call it what they call that of gwcs, also where astropy writes them.
+# `str` and `repr` of a WCS use the name of the gwcs class, also where astropy writes them.
 DetectorWCS.__name__ = WCS.__name__
 
 
@@ -224,22 +224,22 @@ def build_wcs(
     pv : PVPolynomial, optional
         The distortion; none by default.
     pv_cd : (2, 2) array_like, optional
-        Matrix in which the polynomial stands, degrees per pixel; ``cd`` by default.
+        Matrix used by the polynomial, degrees per pixel; ``cd`` by default.
     lookup_table : LookupTable, optional
-        Subtracted after the polynomial.
+        Table that is subtracted after the polynomial.
     image_shape : (int, int), optional
         Shape of the detector, (ny, nx).  The bounding box then covers all of it, -0.5 ... n - 0.5.
     v2v3 : (float, float, float), optional
         V2 and V3 of the reference point in arcseconds, and the position angle of the V3 axis there
         (north through east) in degrees, as ``v2_ref``, ``v3_ref``, ``roll_ref`` of JWST and Roman.
-        The WCS then has the frame ``v2v3``, in arcseconds, in front of ``icrs``, where the
-        correctors of tweakwcs and stcal put theirs.
+        The WCS then has the frame ``v2v3``, in arcseconds, before ``icrs``, where the
+        correctors of tweakwcs and stcal act.
 
     Returns
     -------
     wcs : DetectorWCS
         A `gwcs.WCS` with the frames ``detector``, ``undistorted``, ``icrs``, with ``v2v3`` before
-        the last one where it is asked for.
+        the last one if it is requested.
 
     Raises
     ------
@@ -281,7 +281,7 @@ def build_wcs(
 
 
 def _v2v3_steps(undistorted, sky, v2v3):
-    """Return the steps from undistorted pixels over the frame v2v3 to the sky."""
+    """Return the steps from undistorted pixels to the sky, through the frame v2v3."""
     v2v3 = np.array(v2v3, dtype=float)
     if v2v3.shape != (3,) or not np.all(np.isfinite(v2v3)) or abs(v2v3[1]) >= 90 * 3600:
         raise ValueError(
@@ -297,7 +297,7 @@ def _v2v3_steps(undistorted, sky, v2v3):
         | AffineTransformation2D(along_v2v3 @ sky.cd.value, translation=[0.0, 0.0])
         | Pix2Sky_TAN()
         | RotateNative2Celestial(v2, v3, 180.0)
-        # For V2 on both sides of zero.
+        # V2 may have either sign.
         | SphericalToCartesian(wrap_lon_at=360)
         | CartesianToSpherical(wrap_lon_at=180)
         | Scale(3600.0) & Scale(3600.0)
@@ -321,14 +321,14 @@ def _v2v3_steps(undistorted, sky, v2v3):
 
 
 def pipeline_steps(distortion, sky):
-    """Frames and transforms of a pipeline from pixels to the sky.
+    """Return the frames and transforms of a pipeline from pixels to the sky.
 
     Parameters
     ----------
     distortion : `~astropy.modeling.Model`
-        Pixels to undistorted pixels.
+        Transform from pixels to undistorted pixels.
     sky : `~astropy.modeling.Model`
-        These to right ascension and declination, ICRS, deg.
+        Transform from these to right ascension and declination, ICRS, deg.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The sky of all pixels of an image, band by band."""
+"""Sky coordinates of all pixels of an image, band by band."""
 
 import math
 import os
@@ -27,18 +27,18 @@ def sky_map(wcs, *, image_shape=None, out=None):
     Returns
     -------
     ra, dec : (ny, nx) ndarray
-        Coordinates of the pixel centers in degrees; views of ``out`` where it was given.
+        Coordinates of the pixel centers in degrees; views of ``out`` if it is given.
 
     Raises
     ------
     ValueError
         If the shape of the image is not known, or that of ``out`` does not fit.
     FileExistsError
-        If ``out`` is the path of a file that is there already.
+        If ``out`` is the path of an existing file.
 
     Notes
     -----
-    Beside the outputs it needs some megabytes, whatever the size of the image.
+    In addition to the outputs, it needs some megabytes, whatever the size of the image.
 
     Examples
     --------
@@ -68,7 +68,7 @@ def sky_map(wcs, *, image_shape=None, out=None):
         function = transform.row_function(columns, rows)
     else:
         function = _any_rows(transform, columns, rows)
-    # Threads take bands of rows.
+    # Threads process bands of rows.
     band = max(1, _BAND_SIZE // nx)
 
     def fill(first, last):
@@ -86,7 +86,7 @@ def sky_map(wcs, *, image_shape=None, out=None):
     return ra, dec
 
 
-# Pixels in a band of rows that a thread takes.
+# Number of pixels in a band of rows.
 _BAND_SIZE = 524_288
 
 

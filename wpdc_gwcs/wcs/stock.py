@@ -1,4 +1,4 @@
-"""A WCS of our models as one of stock astropy models."""
+"""Conversion of a WCS to stock astropy models."""
 
 import pickle
 
@@ -27,7 +27,7 @@ __all__ = ["stock_polynomial", "to_stock_wcs"]
 
 
 def to_stock_wcs(wcs):
-    """Build the same WCS of stock astropy models only.
+    """Build the same WCS from stock astropy models only.
 
     Such a WCS can be stored as ASDF and opened where wpdc_gwcs is not installed.
 
@@ -39,7 +39,7 @@ def to_stock_wcs(wcs):
     Returns
     -------
     stock : `gwcs.WCS`
-        With the same frames, pixel shape and bounding box.
+        WCS with the same frames, pixel shape and bounding box.
 
     Raises
     ------
@@ -53,10 +53,10 @@ def to_stock_wcs(wcs):
     `~astropy.modeling.models.Tabular2D` with the same nodes (``splinef2d``, which is the same
     bicubic spline, or ``linear``), so the two agree to rounding, about 1e-8 px.
 
-    The inverse of the first step is a polynomial followed by a table of what the polynomial leaves;
-    it is stored with the WCS, and it is good to 1e-4 px unless the look-up table is as rough as its
-    nodes.  gwcs itself masks positions outside the range of right ascension and declination of the
-    corners, so near a pole ask for ``stock.invert(ra, dec, with_bounding_box=False)``.
+    The inverse of the first step is a polynomial followed by a table of its residuals.  It is
+    stored with the WCS, and is accurate to 1e-4 px unless the look-up table varies from node to
+    node.  gwcs itself masks positions outside the range of right ascension and declination of the
+    corners, so near a pole use ``stock.invert(ra, dec, with_bounding_box=False)``.
     """
     transforms = [step.transform for step in wcs.pipeline[:-1]]
     if list(map(type, transforms)) != [DistortionCorrection, TangentSky]:
@@ -73,8 +73,8 @@ def to_stock_wcs(wcs):
     return stock
 
 
-# The last first step, pickled, and what it was made of: all frames of a detector have it in common,
-# and its inverse takes a while.  A pickle makes a new one in half the time that a copy takes.
+# The last first step, pickled, and its input: all frames of a detector share it, and its inverse
+# takes a while.  Unpickling takes half the time of a copy.
 _last_first_step = (None, None)
 
 
@@ -105,12 +105,12 @@ def stock_polynomial(coefficients):
     Parameters
     ----------
     coefficients : (n, n) ndarray
-        Of ``x^p y^q`` at ``[p, q]``; those of a total degree of n and more are left out.
+        Coefficient of ``x^p y^q`` at ``[p, q]``; total degrees of n and more are ignored.
 
     Returns
     -------
     `~astropy.modeling.models.Polynomial2D`
-        Of total degree n - 1.
+        Polynomial of total degree n - 1.
     """
     n = len(coefficients)
     terms = {f"c{p}_{q}": coefficients[p, q] for p in range(n) for q in range(n - p)}
@@ -118,7 +118,7 @@ def stock_polynomial(coefficients):
 
 
 def _pair(first, second):
-    """Return a 2-in 2-out model of two 2-in 1-out models."""
+    """Combine two 2-in 1-out models to a 2-in 2-out model."""
     return Mapping((0, 1, 0, 1)) | first & second
 
 
@@ -147,9 +147,9 @@ def _stock_distortion(distortion):
 def _with_outer_nodes(table):
     """Return grids and values of a table with one more node at every end.
 
-    Stock tables have no values outside their nodes, and what needs the corners of an image asks for
-    some half a pixel outside.  Of a spline without knots next to its ends the outer cubics go on to
-    the new nodes, and the spline through all of them is the same.
+    Stock tables have no values outside their nodes, but the corners of an image are half a pixel
+    outside.  A spline without knots next to its ends has outer cubics that continue to the new
+    nodes, so the spline through all nodes is the same.
     """
     degree = 3 if table.method == "cubic" else 1
     grids, values = [], np.array([table.dx, table.dy])
@@ -162,7 +162,7 @@ def _with_outer_nodes(table):
 
 
 def _stock_table(x_grid, y_grid, values, method):
-    # The same for both, so that files have them once.
+    # The same objects for both, so that files contain them once.
     points = (np.array(x_grid), np.array(y_grid))
     return _pair(
         *(
@@ -170,8 +170,8 @@ def _stock_table(x_grid, y_grid, values, method):
                 points=points,
                 lookup_table=np.ascontiguousarray(value.T),
                 method="splinef2d" if method == "cubic" else "linear",
-                # The spline does not extrapolate, and an error at the first point outside helps
-                # nobody.
+                # The spline does not extrapolate, and an error at the first point outside would
+                # not help.
                 bounds_error=False,
                 fill_value=np.nan,
             )
@@ -191,7 +191,7 @@ def _stock_sky(sky):
 
 
 # The stock inverse: degree of its polynomial, nodes along each axis it is fitted to, and the
-# numbers of nodes of its table tried in turn until it is as good as asked for (px).
+# numbers of nodes of its table, tried in turn until it has the required accuracy (px).
 _INVERSE_DEGREE = 7
 _INVERSE_FIT_NODES = 33
 _INVERSE_TABLE_NODES = (51, 101, 201)
@@ -199,9 +199,9 @@ _INVERSE_ERROR_PX = 5e-5
 
 
 def _stock_inverse(distortion, image_shape):
-    """Return a stock model of the inverse: a polynomial, then a table of what it leaves.
+    """Return a stock model of the inverse: a polynomial, then a table of its residuals.
 
-    `None` if there is none: no range to make it for, or an image that is folded over.
+    `None` if there is none: without a known range, or for an image that is folded.
     """
     plane_map = distortion._plane_map()
     grid = plane_map.grid
@@ -224,7 +224,7 @@ def _stock_inverse(distortion, image_shape):
     for n_nodes in _INVERSE_TABLE_NODES:
         x_nodes, y_nodes = _axes(wide_x, wide_y, n_nodes)
         x, y = (v.ravel() for v in np.meshgrid(x_nodes, y_nodes))
-        # Where the polynomial takes which image to this node, and which pixel has that image.
+        # Find the image that the polynomial maps to this node, and the pixel of this image.
         image = approximate.invert(x, y, tolerance=1e-10)
         pixel = plane_map.invert(*image, tolerance=1e-10)
         left = np.subtract(pixel, (x, y)).reshape(2, n_nodes, n_nodes)
