@@ -66,7 +66,7 @@ def fit_wcs(wcs, *, image_shape=None, detector="detector", frame="converted"):
     Notes
     -----
     The tangent point is the sky position of the center of the image, or that of the WCS itself if
-    it is a TAN WCS of astropy.  If a polynomial of degree 3 or lower is accurate enough, there is no
+    it is a TAN WCS of astropy.  If a polynomial of degree 3 or less is accurate enough, there is no
     table; otherwise a cubic gets a table of 50 x 50 nodes, or more if needed.  Positions are
     converted to ICRS.  If the bounding box is smaller than the image, the WCS is used beyond it.
 
