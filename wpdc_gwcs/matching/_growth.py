@@ -21,31 +21,31 @@ __all__ = [
     "sample_rows",
 ]
 
-# Sources that take part in fits of the mapping: more would not make it better.
+# Maximum number of sources in fits of the mapping: more would not improve it.
 _FIT_SAMPLE = 20_000
-# Lists up to this length try lower orders when they are stuck: it takes as long as all the rest.
+# Lists up to this length try lower orders if they are stuck, which takes as long as all the rest.
 _EXPLORED = 3000
-# Pairs, and share of the pairs, that a lower order must bring: fewer may be chance.
+# Minimum gain of a lower order, in pairs and as a fraction of the pairs: less may be chance.
 _MORE_PAIRS, _MORE_SHARE = 2.0, 0.05
-# Rounds of a growth; nearly all are at rest after ten.
+# Maximum number of rounds of growth; nearly all converge within ten.
 _MOST_ROUNDS, _MOST_LOCAL_ROUNDS = 40, 12
-# Sets of pairs that differ by less than this share are the same: a few stars come and go for ever.
+# Sets of pairs are equal if they differ by less than this fraction: a few stars may alternate.
 _ALIKE = 0.999
 # Pairing radius in units of the scatter: while the mapping grows, and in the end (chance to lose a
 # right pair: 3e-7).
 _GROW_RADIUS = 5.0
 _FINAL_RADIUS = 5.5
-# Catalogs and centroids have errors of that size at least, px.
+# Minimum error of catalogs and centroids, px.
 _SMALLEST_RADIUS = 0.05
 # While growing, a radius that would be larger by no more than this factor is cut to the limit that
 # the density of stars sets; a larger one says nothing.
 SLACK = 2.5
-# Radius that may be used where stars are so sparse that 0.3 % are expected by chance within it.
+# Expected number of stars by chance within the radius that is allowed where stars are sparse.
 _WIDE_RADIUS = 20.0
 _HARMLESS = np.sqrt(0.003 / MAX_CROWDING)
-# Clipping once the pairs are nearly pure, in units of the scatter.
+# Clipping limit once the pairs are nearly pure, in units of the scatter.
 _LOOSE_CLIP = 50.0
-# Share of the sources, those of the smallest errors, that show what errors do not explain.
+# Fraction of the sources, those with the smallest errors, that show the unexplained scatter.
 _BEST_SHARE = 0.3
 
 
@@ -63,10 +63,10 @@ def fit_pairs(problem, points, reference, *, max_order=None, **options):
 
 
 def grow(problem, points, limit, reference, pairs):
-    """Grow first pairs as far as they carry.
+    """Grow first pairs as far as possible.
 
-    A high order may fit the stars that are there and predict nothing beyond them.  So when the
-    pairs stay, lower orders are tried too, and one that brings clearly more pairs carries on.
+    A high order may fit the present pairs and predict nothing beyond them.  So when the pairs no
+    longer change, lower orders are tried too, and one that yields clearly more pairs is continued.
     """
     grown = _grow_to_rest(problem, points, limit, reference, pairs)
     if grown is None or len(points) > _EXPLORED:
@@ -86,7 +86,7 @@ def grow(problem, points, limit, reference, pairs):
 
 
 def _grow_to_rest(problem, points, limit, reference, pairs):
-    """Fit, predict, pair again with the radius of the fit until the pairs stay."""
+    """Fit, predict and pair again with the radius of the fit until the pairs no longer change."""
     grown = None
     for _ in range(_MOST_ROUNDS):
         step = grow_once(problem, points, limit, reference, pairs, problem.options.max_order)
@@ -112,7 +112,7 @@ def grow_once(problem, points, limit, reference, pairs, max_order):
 
 
 def grow_locally(problem, points, limit, fit, pairs):
-    """Take off what neighboring pairs have in common, and pair again until the pairs stay.
+    """Subtract the common residuals of neighboring pairs, and pair again until convergence.
 
     The pairs are nearly pure by now, so the polynomial is fitted without clipping: clipping
     would keep it from following where the distortion is steepest, in the corners.
@@ -129,8 +129,8 @@ def grow_locally(problem, points, limit, fit, pairs):
             scatter = plane_scatter(*(residual - local(points[i], leave_out=True)[0]).T)
         mapped, leverage = predict(points, fit, local)
         error = scatter * np.sqrt(1 + leverage)
-        # where stars are sparse a wider radius costs nothing, and lets the mapping follow what
-        # it could not foresee
+        # where stars are sparse, a wider radius is harmless, and lets the mapping follow
+        # unexpected distortion
         near = find_nearest(reference.tree, mapped, 1)[1]
         harmless = _HARMLESS * np.minimum(limit, reference.limit[near])
         radius = np.maximum(_GROW_RADIUS * error, np.minimum(_WIDE_RADIUS * error, harmless))
@@ -148,7 +148,7 @@ def final_radius(problem, mapped, pairs, scatter, leverage):
         i, j = pairs
         difference = mapped[i] - problem.stars.points[j]
         error = problem.errors[i]
-        # what the errors do not explain is the same for all: take it from the best stars
+        # the unexplained scatter is the same for all: take it from the best stars
         small = error <= np.quantile(error, _BEST_SHARE)
         floor = max(0.0, plane_scatter(*difference[small].T) ** 2 - np.median(error[small]) ** 2)
         factor = plane_scatter(*(difference / np.sqrt(error**2 + floor)[:, None]).T)
@@ -182,20 +182,20 @@ def predict(sources, fit, local):
 
 
 def sample_rows(n, extra=()):
-    """Choose rows that are enough for a fit, in order, with some that must be among them."""
+    """Choose enough rows for a fit, in order, including some required ones."""
     step = max(1, -(-n // _FIT_SAMPLE))
     rows = np.arange(0, n, step)
     return np.union1d(rows, extra).astype(int) if step > 1 and len(extra) else rows
 
 
 def _count_net(grown, reference):
-    """Pairs less those that chance gives at the radii used."""
+    """Count the pairs beyond those expected by chance at the radii used."""
     _, (i, _), mapped, radius = grown
     near = find_nearest(reference.tree, mapped, 1)[1]
     return len(i) - MAX_CROWDING * float(((radius / reference.limit[near]) ** 2).sum())
 
 
 def _are_alike(pairs, others):
-    """Return whether two sets of pairs differ by next to nothing."""
+    """Return whether two sets of pairs are nearly the same."""
     a, b = (i * (1 << 32) + j for i, j in (pairs, others))
     return 2 * len(np.intersect1d(a, b, assume_unique=True)) >= _ALIKE * (len(a) + len(b))

@@ -44,16 +44,16 @@ def match_sources(
     wcs : object
         Starting WCS with the shared interface of Astropy (`astropy.wcs.WCS`, `gwcs.WCS`).
     image_shape : (int, int), optional
-        Shape of the frame, ``(ny, nx)``; by default that of the WCS, or what the sources span.
+        Shape of the frame, ``(ny, nx)``; by default that of the WCS, or the range of the sources.
     epoch : float or `~astropy.time.Time`, optional
-        Epoch of the frame in Julian years, to which the catalog is moved.  By default the
-        catalog is taken as it is.
+        Epoch of the frame in Julian years, to which the catalog is moved.  By default, the
+        catalog is used as it is.
     max_roundness, min_snr : float
-        Which sources take part, see `select_sources`.
+        Selection of the sources, see `select_sources`.
     max_mag : float, optional
-        Magnitude of the faintest reference stars that take part.
+        Magnitude of the faintest reference stars used.
     **options
-        Choices of `MatchOptions`: how far is searched, what evidence is needed.
+        Fields of `MatchOptions`: the range of the search, the evidence needed.
 
     Returns
     -------
@@ -61,14 +61,14 @@ def match_sources(
         One row per pair: ``source_index``, ``catalog_index`` (rows of the inputs, zero based),
         ``x``, ``y`` [pix] as measured, ``ra``, ``dec`` [deg] of the reference star at the epoch,
         ``dx``, ``dy`` [pix] the source minus its reference star in pixels of the starting WCS, and
-        ``separation`` [pix] the distance that is left once the smooth mapping is taken off.
+        ``separation`` [pix] the distance that remains after the smooth mapping.
     diagnostics : MatchDiagnostics
         Evidence, the smooth mapping found, timings.
 
     Raises
     ------
     MatchError
-        If the evidence for a match is missing; the message says what.
+        If the evidence for a match is insufficient; the message says why.
     ValueError
         If a column is missing or has the wrong unit.
 
@@ -107,7 +107,7 @@ def match_sources(
     xs, ys = pixels(sky.ra.deg, sky.dec.deg)
     xr, yr = pixels(ra, dec)
     if max_mag is not None and mag is not None:
-        # Rows stay in their places: what is not on the plane takes no part.
+        # Rows keep their numbers: positions outside the plane are not used.
         xr = np.where(mag > max_mag, np.nan, xr)
 
     def part(name):
@@ -139,12 +139,12 @@ def match_sources(
 
 
 def pair_table(diagnostics, *, source_index, catalog_index, detector, sky, start, reference):
-    """Make the table of the pairs of a match.
+    """Build the table of the pairs of a match.
 
     Parameters
     ----------
     diagnostics : MatchDiagnostics
-        What the match says about itself; goes into the ``meta`` of the table.
+        Diagnostics of the match, for the ``meta`` of the table.
     source_index, catalog_index : (n,) array_like of int
         Rows of the pairs in the two lists.
     detector : (x, y)
@@ -177,7 +177,7 @@ def pair_table(diagnostics, *, source_index, catalog_index, detector, sky, start
 
 
 def _values(table, name, unit=None, *, required=None):
-    """Plain float array of a column, masked values as NaN; None where there is no such column."""
+    """Column as a float array, with NaN for masked values; None if it is missing."""
     if name not in table.colnames:
         if required:
             raise ValueError(f"{required} must have a column {name!r}; it has {table.colnames}")
@@ -236,7 +236,7 @@ def _read_catalog(catalog, epoch):
         return ra, dec, mag
     pmra, pmdec, ref_epoch = motion
     years = float(getattr(epoch, "jyear", epoch)) - ref_epoch
-    # Stars without a proper motion stay put.
+    # Stars without a proper motion are not moved.
     known = np.isfinite(pmra) & np.isfinite(pmdec) & np.isfinite(years)
     ra, dec = np.array(ra), np.array(dec)
     ra[known], dec[known] = move(ra[known], dec[known], pmra[known], pmdec[known], years[known])[:2]
@@ -255,7 +255,7 @@ def _find_shape(wcs, x, y):
 
 
 def _tangent_plane(wcs, image_shape):
-    """Return the linear map of the plane that touches the WCS in the center of the frame.
+    """Return the linear map of the tangent plane of the WCS at the center of the frame.
 
     Returns a function from RA and Dec to pixels.
     """

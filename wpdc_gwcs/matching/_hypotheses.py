@@ -1,4 +1,4 @@
-"""Hypotheses: which source may be which reference star, from the patterns of their neighbors."""
+"""Hypotheses: candidate pairs of sources and reference stars, from patterns of neighbors."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ __all__ = [
     "find_seeds",
 ]
 
-# Sources of the bright subsets that are tried in turn; then all.
+# Numbers of sources in the bright subsets that are tried in turn; then all are used.
 _LEVELS = (500, 2000)
 # Reference stars per source in a subset: more, since the cuts in flux and magnitude never
 # correspond exactly.
@@ -35,18 +35,18 @@ _SOURCE_SURPLUS = 1.3
 # Stars to look up by their neighborhood and neighbors to compare, try by try: the first finds
 # most fields in a tenth of a second, the last those where half of the neighbors are missing.
 _TRIES = ((16, 8), (49, 12), (196, 24))
-# Comparisons of neighbors in one try: some seconds.
+# Maximum number of comparisons in one try: some seconds.
 _BUDGET = 100_000_000
-# Groups of hypotheses that are followed up.
+# Maximum number of groups of hypotheses to follow.
 _N_SEEDS = 8
-# Triples of pairs tried for a linear mapping, and the share of pairs that should follow it.
+# Number of triples of pairs tried for a linear mapping, and fraction of pairs that should agree.
 _N_TRIPLES = 1000
 _AGREEING_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Seed:
-    """A group of hypotheses that agree, and the lists it is about."""
+    """A group of consistent hypotheses, and the lists that it refers to."""
 
     support: float
     turn: np.ndarray
@@ -58,16 +58,16 @@ class Seed:
     n_near: int
 
     def pairs_to_try(self):
-        """Yield first pairs, rows of the seed's own lists."""
+        """Yield first pairs as rows of the lists of the seed."""
         return first_pairs(self.sources, self.reference, self.hypotheses, self.n_near)
 
     def rows(self, pairs):
-        """Return the rows of the whole lists for pairs of the seed's own."""
+        """Convert pairs of the lists of the seed to rows of the whole lists."""
         return self.source_rows[pairs[0]], self.reference_rows[pairs[1]]
 
 
 def find_seeds(problem):
-    """Yield lists of seeds, one for each try, the seeds of most support first.
+    """Yield a list of seeds for each try, those with most support first.
 
     Bright stars are tried first, then more of them, then all, each with more and more anchors.
     """
@@ -103,8 +103,8 @@ def find_seeds(problem):
 def bright_subsets(problem):
     """Yield rows of sources and reference stars to try in turn, bright ones first.
 
-    A subset has about as many stars of either list as the sparser one has on the frame: what is
-    fainter than the limit of the other list can only disturb.
+    A subset has about as many stars of either list as the sparser one has on the frame: stars
+    fainter than the limit of the other list could only disturb.
     """
     ny, nx = problem.shape
     everything = np.arange(len(problem.sources)), np.arange(len(problem.stars.points))
@@ -128,7 +128,7 @@ def bright_subsets(problem):
 
 
 def count_neighbors(problem, sources, reference, n_neighbors):
-    """Count the neighbors to look at on either side, for so many in the sparser list."""
+    """Numbers of neighbors to compare in both lists, given that of the sparser list."""
     ratio, _, _ = density_ratio_map(*sources.points.T, *reference.points.T, problem.shape)
     many, few = np.quantile(ratio, [0.75, 0.25])
     return tuple(
@@ -138,7 +138,7 @@ def count_neighbors(problem, sources, reference, n_neighbors):
 
 
 def find_groups(problem, sources, reference, rank, n_anchors, n_neighbors, budget):
-    """Make hypotheses for a spread of anchors, and find the groups among them that agree."""
+    """Make hypotheses for spread anchors, and find consistent groups among them."""
     n_source, n_reference = count_neighbors(problem, sources, reference, n_neighbors)
     anchors = _choose_anchors(problem, sources.points, rank, n_anchors)
     distance = np.hypot(*(sources.points[anchors] - problem.frame.center).T)
@@ -189,7 +189,7 @@ def _choose_anchors(problem, sources, rank, n_anchors):
 
 
 def _orientations():
-    """List the eight ways to read a rectangle's axes, the plain one first."""
+    """List the eight orientations of the axes of a rectangle, the identity first."""
     quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
     flip = np.diag([-1.0, 1.0])
     turns = [np.linalg.matrix_power(quarter, n) for n in range(4)]
@@ -208,16 +208,16 @@ def first_pairs(sources, reference, hypotheses, n_neighbors):
         alone = _neighbor_pairs(sources, reference, hypotheses.take(slice(0, 1)), n_neighbors)
         yield alone
         if n_neighbors > N_NEIGHBOURS:
-            # most neighbors are not in the other list: chance has many of them
+            # most neighbors are missing in the other list: many coincidences are by chance
             agreeing = _agreeing_pairs(sources.points, reference.points, alone)
             if agreeing is not None:
                 yield agreeing
 
 
 def _agreeing_pairs(sources, reference, pairs):
-    """Pairs that follow one linear mapping best, by the least quantile of the residuals.
+    """Pairs that agree best with a linear mapping, by the smallest quantile of the residuals.
 
-    Finds the right pairs where they are a minority, which least squares with clipping does not.
+    Unlike least squares with clipping, this finds the correct pairs even if they are a minority.
     """
     i, j = pairs
     if len(i) < 6:
@@ -227,7 +227,7 @@ def _agreeing_pairs(sources, reference, pairs):
     at, to = sources[i], reference[j]
     design = np.dstack([np.ones((_N_TRIPLES, 3)), at[triples]])
     size = np.abs(np.linalg.det(design))
-    # three stars in a row determine nothing
+    # three stars on a line do not determine a mapping
     triples, design = triples[size > np.median(size)], design[size > np.median(size)]
     linear = np.linalg.solve(design, to[triples])
     left = np.column_stack([np.ones(len(i)), at]) @ linear - to

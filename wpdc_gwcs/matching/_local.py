@@ -1,4 +1,4 @@
-"""What a polynomial leaves: a moving local plane through the residuals of neighboring pairs."""
+"""Local corrections: a moving plane through the residuals of neighboring pairs."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -9,7 +9,7 @@ from wpdc_gwcs.robust import plane_scatter
 __all__ = ["LocalCorrection"]
 
 N_NEIGHBOURS = 24
-# The correction must lower the scatter of pairs left out to less than this share, or it is noise.
+# The correction must reduce the scatter of left-out pairs to this fraction, or it is noise.
 _WORTHWHILE = 0.97
 _BLOCK = 32768
 
@@ -22,7 +22,7 @@ class LocalCorrection:
     points : (N, 2) ndarray
         Starting positions of pairs, px.
     residual : (N, 2) ndarray
-        What to add to the mapped positions of these pairs, px.
+        Correction of the mapped positions of these pairs, px.
     """
 
     def __init__(self, points, residual):
@@ -32,9 +32,9 @@ class LocalCorrection:
 
     @classmethod
     def if_worthwhile(cls, points, residual):
-        """Build the correction, or `None` if pairs left out do not profit from it.
+        """Build the correction, or `None` if it does not improve left-out pairs.
 
-        Outliers need no care: pairs lie within a few standard deviations of the mapping.
+        Outliers are no problem: pairs are within a few standard deviations of the mapping.
         """
         if len(points) < 4 * N_NEIGHBOURS:
             return None
@@ -56,7 +56,7 @@ class LocalCorrection:
         Returns
         -------
         correction : (M, 2) ndarray
-            What to add to the mapped positions, px; zero where the neighbors lie on a line.
+            Correction of the mapped positions, px; zero where the neighbors lie on a line.
         leverage : (M,) ndarray
             Variance of the correction in units of the variance of one pair.
         """

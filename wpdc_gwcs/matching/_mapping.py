@@ -43,16 +43,16 @@ def _columns(order, narrow):
 
 
 def find_narrow_axis(image_shape):
-    """0 or 1 where the frame is very narrow in x or y, else None."""
+    """Return 0 or 1 if the frame is very narrow in x or y, else None."""
     ny, nx = image_shape
     return 0 if nx < _NARROW * ny else 1 if ny < _NARROW * nx else None
 
 
 def turn_and_scale(matrix, image_shape):
-    """Rotation and scale of the similarity that comes closest to a matrix on a frame.
+    """Return rotation and scale of the similarity closest to a matrix on a frame.
 
-    The directions of the sides count as the sides are long: across a narrow frame there is nothing
-    to tell a rotation from.
+    The directions of the sides are weighted by their lengths: the short side of a narrow frame does
+    not determine a rotation.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class SmoothMap:
         Displacement in x and y, in products of Chebyshev polynomials of the normalized coordinates
         sorted by total degree.
     center : (2,) ndarray
-        Where the normalized coordinates are zero, px.
+        Origin of the normalized coordinates, px.
     scale : float
         Pixels per normalized unit.
 
@@ -129,7 +129,7 @@ class SmoothMap:
 
     @classmethod
     def identity(cls, image_shape):
-        """Make the mapping that moves nothing, normalized to a frame of the shape ``(ny, nx)``."""
+        """Make the identity mapping, normalized to a frame of the shape ``(ny, nx)``."""
         ny, nx = image_shape
         return cls(
             1, np.zeros((2, 3)), np.array([0.5 * (nx - 1), 0.5 * (ny - 1)]), 0.5 * max(nx, ny)
@@ -164,7 +164,7 @@ class SmoothMap:
         return x + out[0].reshape(x.shape), y + out[1].reshape(y.shape)
 
     def linear_part(self):
-        """Shift at the center of the frame and the matrix of first derivatives there.
+        """Return the shift and the matrix of first derivatives at the center of the frame.
 
         Returns
         -------
@@ -183,8 +183,8 @@ class SmoothMap:
         """Find the starting positions of mapped ones by fixed-point iteration.
 
         The displacement is evaluated no further than 5 % outside the frame, where a polynomial
-        still means something; good to a fraction of a pixel, which is what counting stars in the
-        frame needs.
+        is still meaningful; accurate to a fraction of a pixel, which is enough to count stars in
+        the frame.
         """
         x, y = np.asarray(x, float), np.asarray(y, float)
         cx, cy = self.center
@@ -202,7 +202,7 @@ class SmoothMap:
 
 @dataclass(frozen=True, eq=False)
 class SmoothFit:
-    """A fitted `SmoothMap` with what is needed to say how well it predicts.
+    """A fitted `SmoothMap` with the data for its uncertainty.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ class SmoothFit:
     scatter : float
         Robust scatter per axis of the leave-one-out residuals, px.
     used : (N,) ndarray of bool
-        Pairs that took part after clipping.
+        Pairs used after clipping.
     triangle : (n_terms, n_terms) ndarray
         Triangular factor of the design matrix.
     columns : (n_terms,) ndarray of int
@@ -263,9 +263,9 @@ def fit_smooth_map(
     max_order : int
         Highest order to try.
     clip : float
-        Pairs further off than this many robust standard deviations take no part.
+        Pairs further off than this many robust standard deviations are not used.
     narrow : int, optional
-        Axis in which the frame is narrow, see `find_narrow_axis`.
+        Axis along which the frame is narrow, see `find_narrow_axis`.
 
     Returns
     -------

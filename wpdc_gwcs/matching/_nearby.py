@@ -1,4 +1,4 @@
-"""Matching of a few stars whose places are known to within a given error."""
+"""Matching of a few stars whose positions are known to within a given error."""
 
 import time
 from dataclasses import dataclass
@@ -16,31 +16,31 @@ from wpdc_gwcs.robust import plane_scatter
 
 __all__ = ["match_nearby"]
 
-# A linear mapping follows any three pairs: the fourth is the first to prove anything.
+# A linear mapping fits any three pairs: the fourth one is the first evidence.
 MIN_PAIRS = 4
 # Probability that chance alone gives as many pairs anywhere in the search: so low that a camera of
 # a hundred detectors is still wrong in less than one run of a thousand.
 _MAX_CHANCE = 1e-5
-# Stars that take part in the search for the shift: more would not make its peak clearer.
+# Maximum number of stars in the search for the shift: more would not improve its peak.
 _MOST_STARS = 300
 _MOST_OFFSETS = 400_000
 # Sides of the boxes in which offsets are counted, px: as the offsets may agree.
 _BOXES = (1.5, 4.0, 10.0, 25.0, 60.0)
-# Peaks that are followed up.
+# Maximum number of peaks to follow.
 _N_PEAKS = 4
 # Pairing radius in units of the scatter, and its bounds, px: centroids are not better than the
 # lower one, and pairs that disagree more than the upper one prove nothing.
 _N_SIGMA = 5.0
 _RADII = (0.5, 6.0)
-# Another shift with this share of the pairs is as good: the field repeats itself.
+# Another shift with this fraction of the pairs is as good: the field repeats itself.
 _RIVAL_SHARE = 0.7
-# Pairs from which on a mapping may turn and stretch on its own, and stretch along both axes.
+# Minimum number of pairs for a rotation and scale, and for a full linear mapping.
 _FOR_SIMILARITY, _FOR_LINEAR = 3, 6
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """A linear mapping and what it pairs."""
+    """A linear mapping and its pairs."""
 
     linear: np.ndarray  # (3, 2): constant, x, y
     pairs: tuple
@@ -54,7 +54,7 @@ class _Candidate:
 def match_nearby(
     xs, ys, xr, yr, *, image_shape, max_shift, max_bend, flux=None, mag=None, tiles=None
 ):
-    r"""Pair sources with reference stars when a prediction says nearly where they are.
+    r"""Pair sources with reference stars whose positions are nearly known.
 
     Parameters
     ----------
@@ -65,16 +65,16 @@ def match_nearby(
     image_shape : (int, int)
         Shape of the frame, ``(ny, nx)``.
     max_shift : float
-        Largest error of the prediction that the frame as a whole has, px.
+        Largest common error of the prediction for the whole frame, px.
     max_bend : float
-        Largest error that is left on the frame without the shift (turn, stretch), px.
+        Largest remaining error on the frame without the shift (rotation, stretch), px.
     flux : (N,) array_like, optional
         Brightness of the sources.
     mag : (M,) array_like, optional
         Magnitudes of the reference stars.
     tiles : ((N,) array_like, (M,) array_like), optional
-        Numbers of the exposures that sources and reference stars belong to, where those of several
-        are given that one mapping must suit; pairs are made within an exposure.
+        Numbers of the exposures of sources and reference stars, if several exposures share one
+        mapping; pairs are made within an exposure.
 
     Returns
     -------
@@ -89,7 +89,7 @@ def match_nearby(
     Raises
     ------
     MatchError
-        If chance could have given the pairs, or there are too few.
+        If the pairs could be by chance, or there are too few.
 
     Notes
     -----
@@ -102,7 +102,7 @@ def match_nearby(
     local = np.column_stack([xs, ys]), np.column_stack([xr, yr])
     sources, reference = local
     if tiles is not None:
-        # side by side, further apart than any search reaches
+        # side by side, further apart than the range of any search
         step = np.array([100.0 * (max(image_shape) + max_shift + max_bend), 0.0])
         sources, reference = (
             p + np.asarray(t, float)[:, None] * step for p, t in zip(local, tiles, strict=True)
@@ -172,7 +172,7 @@ def match_nearby(
 
 
 def _brightest(points, brightness, *, inside=None):
-    """Rows of the brightest stars, or all where there is no order."""
+    """Rows of the brightest stars, or of all without an order."""
     rows = np.arange(len(points))
     if len(points) <= _MOST_STARS:
         return rows
@@ -218,7 +218,7 @@ def _peaks(sources, reference, max_shift, max_bend):
     peaks.sort(key=lambda p: -p[0])
     chosen = []
     for _, shift, width in peaks:
-        # the same peak in boxes of another side or edge is no other start
+        # the same peak in boxes of another size or grid is not a new start
         if all(np.hypot(*(shift - s)) > 0.7 * min(width, w) for s, w in chosen):
             chosen.append((shift, width))
         if len(chosen) == 2 * _N_PEAKS:
@@ -244,7 +244,7 @@ def _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend
         if key == before:
             break
         before = key
-        # never wider: what is far off at the edge comes in as the mapping turns, not by reach
+        # never wider: stars far off at the edge are reached as the mapping rotates
         radius = float(np.clip(_N_SIGMA * scatter, _RADII[0], max(0.7 * radius, _RADII[0])))
     radius = float(np.clip(_N_SIGMA * scatter, *_RADII))
     bend = np.linalg.norm(linear[1:], 2) * scale
@@ -310,7 +310,7 @@ def _by_chance(moved, paired, tree, radius):
     wide = max(10 * radius, 1.5 * _typical_distance(tree))
     near = tree.query_ball_point(moved, wide, return_length=True).astype(float)
     near[paired] -= 1
-    # half a star where none is near: none does not mean that none could be
+    # half a star if none is near, because the density is not zero
     return float(np.sum(np.maximum(near, 0.5)) * (radius / wide) ** 2)
 
 

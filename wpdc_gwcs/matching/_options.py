@@ -1,4 +1,4 @@
-"""What a match is asked for."""
+"""Options of a match."""
 
 from dataclasses import dataclass
 
@@ -9,12 +9,12 @@ __all__ = ["MatchOptions"]
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """How far a match searches, and what evidence it needs.
+    """Range of the search for a match, and the evidence needed.
 
     Parameters
     ----------
     blind : bool
-        Search also mirrored frames, frames turned by 90, 180 and 270 degrees, scales off by up to
+        Also search mirrored frames, frames rotated by 90, 180 and 270 degrees, scales off by up to
         6 % and pointings off by up to 0.3 of the frame.
     max_shift : float, optional
         Largest error of the pointing, px; default 0.15 of the longer side, at least 450 px.
@@ -28,10 +28,10 @@ class MatchOptions:
     max_order : int
         Highest order of the smooth mapping.
     min_significance : float
-        Significance over chance that the pairs must have, sigma; 0.7 of it do where stars are so
-        few that all mappings the search could have found are counted.
+        Minimum significance of the pairs over chance, sigma; 0.7 of it is enough if there are so
+        few stars that all possible mappings are counted.
     min_purity : float
-        Least share of right pairs.
+        Minimum fraction of correct pairs.
 
     Raises
     ------
@@ -45,9 +45,9 @@ class MatchOptions:
     max_scale: float = 0.03
     max_distortion: float | None = None
     max_order: int = MAX_ORDER
-    # A chance of 3e-18: nine orders of magnitude are left for what the search may choose from.
+    # A probability of 3e-18: nine orders of magnitude remain for the choices of the search.
     min_significance: float = 9.0
-    # A fit with clipping bears one wrong pair in ten.
+    # A fit with clipping tolerates one wrong pair in ten.
     min_purity: float = 0.9
 
     def __post_init__(self):

@@ -5,26 +5,26 @@ from scipy.spatial import cKDTree
 
 __all__ = ["find_edges", "find_nearest", "one_to_one", "pair_nearest"]
 
-# Points from which on a second thread is worth its start.
+# Minimum number of points for a second thread.
 _THREADED = 20_000
 
 
 def find_nearest(tree, points, k, **options):
-    """Query a tree with as many threads as pay."""
+    """Query a tree with a useful number of threads."""
     return tree.query(points, k=k, workers=2 if len(points) > _THREADED else 1, **options)
 
 
 def find_edges(points, tree, radius, *, limit=None, slack=1.0):
-    """List who has whom within reach.
+    """List the points and partners within reach of each other.
 
     Parameters
     ----------
     points : (N, 2) ndarray
-        Positions that look for partners.
+        Positions.
     tree : `~scipy.spatial.cKDTree`
         Tree of the possible partners.
     radius : (N,) ndarray
-        Reach of each point; a point with radius <= 0 or NaN looks for nobody.
+        Reach of each point; a point with radius <= 0 or NaN has no partners.
     limit : (M,) ndarray, optional
         Largest radius that may be used to reach each partner (where partners stand close, a wide
         radius says nothing).
@@ -53,7 +53,7 @@ def find_edges(points, tree, radius, *, limit=None, slack=1.0):
     partner = partner.reshape(len(active), -1)
     inside = distance <= reach[:, None]
     if limit is not None:
-        # the tree answers index n where there is nobody
+        # the tree returns index n for no partner
         allowed = np.append(limit, 0.0)[partner]
         inside &= (reach[:, None] <= slack * allowed) & (distance <= allowed)
     row, column = np.nonzero(inside)
@@ -61,7 +61,7 @@ def find_edges(points, tree, radius, *, limit=None, slack=1.0):
 
 
 def one_to_one(i, j, n_points, n_partners):
-    """Pick the edges whose two ends have no other edge.
+    """Select the edges whose ends have no other edge.
 
     Returns
     -------
@@ -77,10 +77,10 @@ def one_to_one(i, j, n_points, n_partners):
 
 
 def pair_nearest(xs, ys, xr, yr, radius):
-    """Pair two lists of positions one to one within a radius, leaving out what is ambiguous.
+    """Pair two lists of positions one to one within a radius, without ambiguous ones.
 
-    A pair is delivered when the source has exactly one reference star within its radius and no
-    other source reaches the same reference star.  Nothing is guessed: where two candidates lie
+    A pair is returned if the source has exactly one reference star within its radius and no
+    other source reaches the same reference star.  Nothing is guessed: if two candidates lie
     within the radius, on either side, none of them is paired.
 
     Parameters

@@ -12,9 +12,9 @@ from wpdc_gwcs.matching._pairs import find_nearest
 
 __all__ = ["MAX_CROWDING", "MIN_STARS", "Limits", "Problem", "Stars", "prepare_problem"]
 
-# Fewer stars than this in either list cannot give evidence whatever they do.
+# Fewer stars than this in either list cannot be evidence.
 MIN_STARS = 8
-# A radius must not reach further than where this many stars are expected by chance.
+# Maximum number of stars expected by chance within a radius.
 MAX_CROWDING = 0.25
 # Displacement by distortion that is searched for, px; on a small detector as a share of its side:
 # what such a limit allows in scale and rotation grows as the detector shrinks.
@@ -22,13 +22,13 @@ _MAX_DISTORTION = 250.0
 _MAX_DISTORTION_SHARE = 0.12
 # Error of the pointing that is searched for: px, and share of the longer side; in a blind search.
 _MAX_SHIFT, _MAX_SHIFT_SHARE, _BLIND_SHIFT_SHARE = 450.0, 0.15, 0.3
-# Error of the scale that a blind search allows at least: some headers have that of another binning.
+# Minimum scale error allowed in a blind search: some headers have the scale of another binning.
 _BLIND_SCALE = 0.06
 
 
 @dataclass(frozen=True, eq=False)
 class Stars:
-    """One list of stars: positions, tree and how wide a radius may be at each of them."""
+    """A list of stars: positions, tree, and the maximum radius at each star."""
 
     points: np.ndarray
     tree: cKDTree
@@ -73,7 +73,7 @@ class Problem:
     """Two lists in one plane and the rules of their match."""
 
     sources: np.ndarray
-    limit: np.ndarray  # largest radius that says something at each source
+    limit: np.ndarray  # largest meaningful radius at each source
     stars: Stars  # the reference
     source_rows: np.ndarray  # rows of the inputs
     reference_rows: np.ndarray
@@ -87,7 +87,7 @@ class Problem:
     options: MatchOptions
 
     def turned(self, turn):
-        """Turn all sources about the center of the frame."""
+        """Rotate all sources about the center of the frame."""
         return (self.sources - self.frame.center) @ turn.T + self.frame.center
 
 
@@ -181,7 +181,7 @@ def _prepare(name_x, name_y, x, y, brightness, name_brightness):
             )
         brightness = brightness[rows]
         known = np.isfinite(brightness)
-        # ties or gaps in more than half of the values leave no order to speak of
+        # with ties or gaps in more than half of the values there is no useful order
         if known.sum() < 0.5 * len(rows) or len(np.unique(brightness[known])) < 0.5 * known.sum():
             brightness = None
         else:

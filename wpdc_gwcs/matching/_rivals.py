@@ -1,17 +1,17 @@
-"""Self-repeating fields: another shift at which the same sources have partners too."""
+"""Self-repeating fields: other shifts at which the same sources have partners."""
 
 import numpy as np
 
 __all__ = ["find_rival_offset"]
 
-# Offsets between sources and reference stars that are looked at, and paired sources at least.
+# Maximum number of offsets between sources and stars, and minimum number of paired sources.
 _MOST_OFFSETS = 50_000
 _FEWEST_SOURCES = 50
 _MOST_SOURCES = 1000
 # Widths of the boxes in which offsets are counted, in pairing radii: where one pattern is found
 # through another one's mapping the offsets may agree much better than that mapping's scatter.
 _BOX_WIDTHS = (2.0, 0.5, 0.125)
-# Share of the paired sources that must have a partner at the rival offset too.
+# Fraction of the paired sources that must have a partner at the rival offset, too.
 _LEAST_SHARE = 0.5
 _LEAST_COUNT = 5
 
@@ -30,14 +30,14 @@ def find_rival_offset(mapped, partner, tree, radius, *, center, max_offset):
     radius : float
         Pairing radius, px.
     center : (2,) ndarray
-        Offset about which others are looked for, px.
+        Center of the search for other offsets, px.
     max_offset : float
-        How far from it, px.
+        Range of the search, px.
 
     Returns
     -------
     (2,) ndarray or None
-        The offset, px, or `None` if no other one suits half of the sources.
+        The offset, px, or `None` if no other one fits half of the sources.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""The verdict: pairs with their final radius, their evidence, rivals, and what is refused."""
+"""The verdict: final pairs, their evidence, rivals, and refusals."""
 
 from dataclasses import dataclass, replace
 
@@ -35,8 +35,8 @@ __all__ = [
     "without_rival",
 ]
 
-# Where either list has no more stars than this on the frame, the few are judged by `judge_few` too:
-# with more, right matches have enough pairs for the chance level to be counted.
+# If either list has no more stars than this on the frame, `judge_few` is used as well; with more,
+# correct matches have enough pairs to count the chance level.
 _FEW = 100
 # Significance and purity below which the pairs of a subset are not carried to the whole frame: it
 # only spares hopeless starts the full round.
@@ -45,7 +45,7 @@ _HOPELESS_SIGNIFICANCE, _HOPELESS_PURITY = 4.0, 0.5
 # worse; and the better one of two is looked for so many times.
 _EQUAL = 0.7
 _MOST_RIVALS = 4
-# Pairs agree with a match within so many radii; most is more than that share.
+# Pairs agree with a match within this many radii; "most" means more than this fraction.
 _EXPLAINED, _MOST = 3.0, 0.5
 # No header is right up to a rotation and yet so far off in the area of a pixel: that is a mirror.
 _MOST_STRETCH = 2.0
@@ -58,7 +58,7 @@ _HINT = (
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """What a search found: the mapping, the pairs and their evidence."""
+    """Result of a search: the mapping, the pairs and their evidence."""
 
     turn: np.ndarray
     turned_mapping: SmoothMap
@@ -71,21 +71,21 @@ class Match:
 
     @property
     def mapping(self):
-        """The mapping of the frame as it was given."""
+        """The mapping of the frame in its original orientation."""
         return _turn_mapping(self.turned_mapping, self.turn)
 
     @property
     def parity(self):
-        """-1 where the frame is mirrored."""
+        """-1 if the frame is mirrored, else 1."""
         return int(np.sign(np.linalg.det(self.turn)))
 
 
 @dataclass(frozen=True, eq=False)
 class Attempts:
-    """What has been tried without success so far."""
+    """Unsuccessful attempts so far."""
 
     best: Evidence | None = None
-    # starts that were right as a whole but for a part of the frame
+    # starts that match except in a part of the frame
     n_partial: int = 0
 
     def after(self, evidence, *, partial=False):
