@@ -126,6 +126,20 @@ def test_counts_and_contents(text, page):
     assert {"detectors", "frames", "each", "settings", "detector-0", "detector-1"} <= page.ids
 
 
+def test_the_heading_is_that_of_the_page(text):
+    assert re.findall(r"<h1>(.*?)</h1>", text) == ["Night 1"]
+    assert re.findall(r"<title>(.*?)</title>", text) == ["Night 1"]
+
+
+def test_what_is_wrong_comes_first(text):
+    """The failed frame, then the degraded one, each with its reason, and no solved one."""
+    (found,) = re.findall(r'<ul class="problems">(.*?)</ul>', text, re.DOTALL)
+    items = [re.sub(r"<.*?>", "", item) for item in re.findall(r"<li>(.*?)</li>", found, re.DOTALL)]
+    expected = ["&lt;b&gt;: failed: no match &amp; no hope", "a2: degraded: few stars"]
+    assert [" ".join(item.split()) for item in items] == expected
+    assert text.index('id="problems"') < text.index('id="detectors"')
+
+
 def test_frames_have_the_important_columns_and_are_folded(text, page):
     frames = page.tables[1]
     assert frames[0][0] == "frame"

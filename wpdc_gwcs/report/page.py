@@ -53,6 +53,8 @@ _FEW_DETECTORS = 6
 _MOST_POOLED, _MOST_FIGURES, _MOST_ROWS = 100, 100, 500
 # Characters of a column before its texts are broken.
 _WIDEST = 34
+# Reasons that fit at the beginning of a page.
+_MOST_PROBLEMS = 30
 _POOLED = ("x", "y", "dx", "dy", "used", "holdout", "phot_g_mean_mag", "snr")
 
 
@@ -108,15 +110,18 @@ def write_report(summary, solutions, matches, file, *, title="Calibration report
                 text += f"  Pooled over {len(chosen)} of its {len(mine)} frames, evenly chosen."
             small = len(names) > _FEW_DETECTORS
             figures = detector_figures(name, solutions.get(name), table, small=small)
-            title = f"Detector {name}"
-            sections.append({"id": link, "title": title, "text": text, "figures": figures})
+            heading = f"Detector {name}"
+            sections.append({"id": link, "title": heading, "text": text, "figures": figures})
         rows.append(_detector_row(summary, name, table, link))
+    problems = _problems(summary, ids)
     page = Environment(autoescape=True).from_string(PAGE)
     file.write(
         page.render(
             title=title,
             counts=_counts(summary),
-            contents=_contents(sections, ids, about or solutions),
+            problems=problems[:_MOST_PROBLEMS],
+            more_problems=max(0, len(problems) - _MOST_PROBLEMS),
+            contents=_contents(sections, ids, about or solutions, problems),
             detectors=_without_empty({"columns": _columns(_DETECTOR, _TEXTS), "rows": rows}),
             sections=sections,
             left_out=len(summary) - len(shown),
@@ -168,8 +173,26 @@ def _counts(summary):
     return f"{counted(len(states), 'frame')}: {', '.join(parts)}."
 
 
-def _contents(sections, ids, about):
+def _problems(summary, ids):
+    """List the frames that failed, then those that are degraded, with their reasons."""
+    reasons = summary["reason"] if "reason" in summary.colnames else [""] * len(summary)
+    found = [
+        {
+            "frame": str(frame),
+            "status": str(status),
+            "reason": str(reason),
+            "id": ids.get(str(frame)),
+        }
+        for frame, status, reason in zip(summary["frame"], summary["status"], reasons, strict=True)
+        if str(status) != "solved"
+    ]
+    return sorted(found, key=lambda one: one["status"] != "failed")
+
+
+def _contents(sections, ids, about, problems):
     entries = [{"id": "detectors", "title": "Detectors"}, *sections]
+    if problems:
+        entries.insert(0, {"id": "problems", "title": "Failed and degraded frames"})
     entries.append({"id": "frames", "title": "Frames"})
     if ids:
         entries.append({"id": "each", "title": "Frame by frame"})

@@ -61,7 +61,14 @@ are after 3-sigma clipping.</p>
 <nav aria-label="Contents"><ul>
 {% for entry in contents %}<li><a href="#{{ entry.id }}">{{ entry.title }}</a></li>
 {% endfor %}</ul></nav>
-<h2 id="detectors">Detectors</h2>
+{% if problems %}<h2 id="problems">Failed and degraded frames</h2>
+<ul class="problems">
+{% for one in problems %}<li>{% if one.id %}<a href="#{{ one.id }}">{{ one.frame }}</a>{% else %}{{
+one.frame }}{% endif %}: {{ one.status }}{% if one.reason %}: {{ one.reason }}{% endif %}</li>
+{% endfor %}</ul>
+{% if more_problems %}<p class="quiet">{{ more_problems }} more are in the table of
+<a href="#frames">frames</a>.</p>{% endif %}
+{% endif %}<h2 id="detectors">Detectors</h2>
 <p class="quiet">All frames of a detector together.</p>
 {{ show(detectors) }}
 {% for section in sections %}<h2 id="{{ section.id }}">{{ section.title }}</h2>
