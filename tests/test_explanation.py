@@ -228,3 +228,17 @@ def test_positions_that_are_worse_than_their_errors(sky, rng):
     ratio = int(re.search(r"the residuals are (\d+) times", advice)[1])
     stated = np.median(np.asarray(sources["x_err"], float))
     assert 0.5 < ratio / (min(residuals["sigma_dx"], residuals["sigma_dy"]) / stated) < 1.5
+
+
+def test_a_header_that_points_beside_the_catalog(sky):
+    """Many stars are in reach and none is on the frame: the catalog is not too shallow."""
+    frame = sky.exposures[0].frame()
+    x, y = frame.wcs.world_to_pixel_values(sky.reference["ra"], sky.reference["dec"])
+    stars = sky.reference[(0 < x) & (x < 511) & (0 < y) & (y < 511)]
+    wcs = frame.wcs.deepcopy()
+    wcs.wcs.crpix = wcs.wcs.crpix + np.array([0.0, 530.0])
+    told = explain_frame(replace(frame, wcs=wcs), stars)
+    (line,) = [s.lines[0] for s in told.stages if s.name == "catalog"]
+    assert line.endswith("in reach, 0 on the frame by its header")
+    assert any("the header may point elsewhere" in advice for advice in told.advice)
+    assert not any("deeper" in advice for advice in told.advice)

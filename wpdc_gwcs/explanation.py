@@ -251,10 +251,17 @@ def _tell_catalog(story, stars, reference, start):
     n = int(np.sum(story.found["usable"]))
     if inside > 20 * max(n, 1) and n >= _FEW:
         story.advice.append("the catalog is far deeper than the frame: try --max-mag")
-    if n > 20 * max(inside, 1):
+    source = shlex.quote(story.frame.source)
+    if inside < _FEW and len(reference) >= _PLENTY:
+        story.advice.append(
+            "the header may point elsewhere, or the catalog does not cover the frame: give another "
+            f"header (--wcs HEADER), or wpdc catalog prepare gaia --around {source} --output "
+            "gaia.fits"
+        )
+    elif n > 20 * max(inside, 1):
         story.advice.append(
             "the frame is far deeper than the catalog: use a deeper one, such as wpdc catalog "
-            f"prepare gaia --around {shlex.quote(story.frame.source)} --output gaia.fits"
+            f"prepare gaia --around {source} --output gaia.fits"
         )
 
 
@@ -372,7 +379,7 @@ def _try_otherwise(story, stars, sources, *, last=True):
         return
     if last:
         story.advice.append(
-            "neither a blind search nor fainter stars match: look whether frame and catalog show "
+            "neither a blind search nor fainter stars match: check whether frame and catalog show "
             "the same sky, whether the scale is right (--pixel-scale), and the position angle: "
             "other angles than multiples of 90 deg are not searched (--wcs HEADER)"
         )
