@@ -290,6 +290,8 @@ def test_transform_of_a_table(results, tmp_path, capsys):
         (["pix2sky", "{file}", "-100", "5"], 1, "outside the detector"),
         (["sky2pix", "{file}", "300.0", "-60.0"], 1, "outside the sky of the detector"),
         (["pix2sky", "{file}", "1", "2", "3"], 2, "got 3 values"),
+        (["pix2sky", "{file}", "1024"], 2, "give x and y, or one table; got 1 value: 1024"),
+        (["export", "{file}", "--output", "o"], 2, "export needs --format, one of fits, cpdis, "),
         (["pix2sky", "{file}", "1", "two"], 2, "must be numbers, got 1 two"),
         (["pix2sky", "{file}", "1", "2", "--origin", "2"], 2, "--origin must be 0 or 1, got 2"),
         (["pix2sky", "missing.asdf", "1", "2"], 2, "missing.asdf"),

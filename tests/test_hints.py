@@ -82,6 +82,12 @@ def test_of_real_errors(folder, capsys, frame, catalog, hint):
     assert ("; try" in line) == bool(hint)
 
 
+def test_of_folders_that_are_no_results(folder, capsys):
+    for command in ("evaluate", "report"):
+        assert run([command, str(folder / "night")]) == 2
+        assert error_of(capsys).endswith("; try: the output folder of wpdc calibrate")
+
+
 def test_of_a_catalog_without_positions(folder, capsys):
     assert run(["catalog", "info", str(folder / "no-positions.ecsv")]) == 2
     assert error_of(capsys).endswith("; try: rename its columns to ra and dec, in degrees")

@@ -74,6 +74,8 @@ def export_command(
     """
     if format is None and into is not None:
         format = "tpv"
+    if format is None:
+        raise InputError(f"export needs --format, one of {', '.join(FORMATS)}, or --into IMAGE")
     if format not in FORMATS:
         raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
     if into is None and output is None:

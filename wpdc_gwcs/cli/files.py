@@ -111,7 +111,7 @@ def _transform(file, points, origin, output, overwrite, *, forward):
         x, y = wcs.invert(a, b)
         return x + origin, y + origin
 
-    if len(points) == 1:
+    if len(points) == 1 and not (_is_number(points[0]) and not Path(points[0]).exists()):
         _transform_table(points[0], names, transform, output, overwrite)
         return
     a, b = _numbers(points, names[:2])
@@ -123,6 +123,14 @@ def _transform(file, points, origin, output, overwrite, *, forward):
         raise typer.Exit(1)
     digits = 10 if forward else 5
     typer.echo(" ".join(f"{value:.{digits}f}" for value in result))
+
+
+def _is_number(text):
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _numbers(points, names):

@@ -18,6 +18,15 @@ __all__ = ["hint_of", "hint_of_frame"]
 # Messages of errors that end a command, and hints; "{path}" is the path that begins the message.
 _OF_COMMANDS = (
     (
+        r".*summary\.ecsv: must be a readable file: No such file"
+        r"|.*the folder has no \*\.matches\.ecsv",
+        "the output folder of wpdc calibrate",
+    ),
+    (
+        r".*monitor needs a \*\.solution\.asdf",
+        "the --solution of the frames",
+    ),
+    (
         r"(?P<path>.+?): (?:catalog must be an existing file|must be a readable file: No such file"
         r"|no such file|no such configuration file)",
         "_similar",
