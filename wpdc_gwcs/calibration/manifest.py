@@ -1,4 +1,4 @@
-"""The manifest of a run: what went in, how, and how far it has come."""
+"""The manifest of a run: inputs, settings and progress."""
 
 import dataclasses
 import hashlib
@@ -20,27 +20,27 @@ from wpdc_gwcs.exceptions import FileFormatError, FrameFailure, InternalError
 __all__ = ["Manifest", "files_of", "frame_sum", "plan_run", "read_manifest"]
 
 _PACKAGES = ("wpdc_gwcs", "numpy", "scipy", "astropy", "gwcs", "asdf", "photutils", "sep")
-# What the same run has the same of.
+# Entries that must be the same to resume a run.
 _CHOICES = ("software", "settings", "catalog", "solution", "update")
 
 
 @dataclass(frozen=True, eq=False)
 class Manifest:
-    """What a run is, and what has become of its frames.
+    """Description of a run and the state of its frames.
 
     Parameters
     ----------
     run : str
         Identity of the run, which all its files carry.
     created : str
-        When it began, UTC.
+        Start time, UTC.
     software, settings, catalog, solution, update : dict, str, bool
-        Versions, options, and sums over the reference catalog and the stored solutions.
+        Versions, options, and checksums of the reference catalog and the stored solutions.
     inputs : list of dict
         Path, size and time of each input file.
     frames : dict
-        Frame name to ``detector``, ``camera``, ``exposure``, ``input`` (sum over what the frame
-        is), ``group`` (number of those that it is solved with), ``state`` (``pending``, ``solved``,
+        For each frame ``detector``, ``camera``, ``exposure``, ``input`` (checksum of its inputs),
+        ``group`` (number of its group, which is solved together), ``state`` (``pending``, ``solved``,
         ``degraded`` or ``failed``) and, once it is done, ``error`` (class of the failure) and
         ``files``.
     """

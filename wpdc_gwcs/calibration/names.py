@@ -23,23 +23,23 @@ def file_stem(name):
 
 
 def superseded_name(solution):
-    """Name of the file of a solution that no longer holds.
+    """Return the file name of a solution that no longer holds.
 
     Parameters
     ----------
     solution : DistortionSolution
-        With the epoch until which it was valid.
+        Solution with the epoch until which it was valid.
 
     Returns
     -------
     str
-        Such as ``ccd1.until-2024.5000.solution.asdf``.
+        For example ``ccd1.until-2024.5000.solution.asdf``.
     """
     return f"{file_stem(solution.detector)}.until-{solution.valid_to:.4f}.solution.asdf"
 
 
 def names_of(group, cameras):
-    """Name the files that a group of frames may write.
+    """List the files that a group of frames may write.
 
     Parameters
     ----------
@@ -52,12 +52,12 @@ def names_of(group, cameras):
     Returns
     -------
     dict
-        Name to what it is of.
+        Owner of each file, by file name.
 
     Raises
     ------
     InputError
-        If two detectors have one name in files.
+        If two detectors have the same file name.
     """
     names = {
         frame.name + suffix: frame.source or frame.name
@@ -86,17 +86,17 @@ def names_of(group, cameras):
 
 
 def check_distinct(names):
-    """Make sure that no two things have one file.
+    """Check that no file has two owners.
 
     Parameters
     ----------
     names : iterable of dict
-        What `names_of` returned, for all groups.
+        As returned by `names_of`, for all groups.
 
     Raises
     ------
     InputError
-        If they do.
+        If a file has two owners.
     """
     owners = {}
     for files in names:

@@ -1,4 +1,4 @@
-"""The result folder of a run: names that are checked first, and sets of files that are whole."""
+"""The result folder of a run: checked names, and complete sets of files."""
 
 import json
 import os
@@ -27,10 +27,10 @@ from wpdc_gwcs.exceptions import InputError
 
 __all__ = ["ERRORS", "Outcome", "ResultFolder"]
 
-#: Where the details of internal errors are.
+#: File with the details of internal errors.
 ERRORS = "errors.log"
-# The manifest and the summary are written anew when they lack this share of themselves: ten times
-# in all while they grow to their 2.6-fold, however many frames there are.
+# The manifest and the summary are rewritten whenever they have grown by this fraction: ten times
+# while they grow by a factor of 2.6, however large they are.
 _SHARE = 0.1
 # More detectors than any camera has.
 _ALL = 1 << 30
@@ -38,18 +38,18 @@ _ALL = 1 << 30
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What was found of frames that are solved together.
+    """Results of frames that are solved together.
 
     Parameters
     ----------
     calibrations : list of Calibration
-        Of the solved frames.
+        Calibrations of the solved frames.
     solutions, superseded : dict
-        Detector to its solution, and to the stored one that no longer holds.
+        Solution of each detector, and the stored one that no longer holds.
     failures : dict
-        Frame name to error.
+        Errors by frame name.
     cameras : list of Camera
-        Of the detectors that were solved together.
+        Cameras of the detectors that were solved together.
     rows : list of dict
         Rows of the summary, one for each frame.
     """
@@ -72,7 +72,7 @@ class ResultFolder:
     overwrite : bool, optional
         Whether files may be replaced.
     resume : bool, optional
-        Whether what a run of the same inputs and choices has done is left as it is.
+        Whether to keep the results of a run with the same inputs and settings.
 
     Raises
     ------
@@ -119,7 +119,7 @@ class ResultFolder:
             self._release()
 
     def _tidy(self):
-        """Complete what was begun, and write what the journals say into manifest and summary."""
+        """Complete interrupted writes, and merge the journals into manifest and summary."""
         clean(self.folder)
         for run, journal in find_journals(self.folder).items():
             path = self.folder / MANIFEST
@@ -135,7 +135,7 @@ class ResultFolder:
             os.close(self._lock)
 
     def earlier_groups(self):
-        """Return which frames the run that is to be resumed has solved together.
+        """Return the groups of frames that the run to resume has solved together.
 
         Returns
         -------
@@ -151,20 +151,20 @@ class ResultFolder:
         return read_manifest(path).groups() if self._resume and path.exists() else []
 
     def check(self, groups, *, inputs=()):
-        """Check all names before the work.
+        """Check all file names before the work.
 
         Parameters
         ----------
         groups : list of list of Frame
             Frames that are solved together.
         inputs : list of Path, optional
-            Files besides those of the frames that are never replaced.
+            Other input files that must not be replaced.
 
         Raises
         ------
         InputError
-            If two things have one file, if a file is there and may not be replaced, or if an input
-            would be replaced.
+            If two results have the same file, if a file exists and may not be replaced, or if an
+            input would be replaced.
         """
         cameras = {}
         for group in groups:
@@ -182,7 +182,7 @@ class ResultFolder:
             self._require_free(name)
 
     def begin(self, groups, plan):
-        """Begin a run, or go on with one.
+        """Begin or resume a run.
 
         Parameters
         ----------
@@ -194,13 +194,13 @@ class ResultFolder:
         Returns
         -------
         Manifest
-            The run; with the identity of the one that is resumed.
+            The run, with the identity of the resumed one.
 
         Raises
         ------
         InputError
-            If the run that is to be resumed was of other choices, or if a file of what it has not
-            done may not be replaced.
+            If the run to resume has other settings, or if a file of its remaining frames exists
+            and may not be replaced.
         """
         self._manifest = plan
         if self._resume:
@@ -210,7 +210,7 @@ class ResultFolder:
         return self._manifest
 
     def _require_free(self, name):
-        """Refuse to go on if a file of the folder is there and may not be replaced."""
+        """Raise an error if a file of the folder exists and may not be replaced."""
         path = self.folder / name
         try:
             mode = path.stat().st_mode
@@ -228,7 +228,7 @@ class ResultFolder:
             raise InputError(f"{path}: file exists, and is replaced only with --overwrite")
 
     def _continue(self, earlier, groups):
-        """Take over what an earlier run has done, if it was of the same choices."""
+        """Take over the results of an earlier run with the same settings."""
         plan = self._manifest
         found = earlier.differences(plan)
         if found and self._overwrite:
@@ -264,11 +264,11 @@ class ResultFolder:
         files = {name for n in {*others, *states} for name in earlier.frames[n]["files"]}
         self._shared = {n: _ALL for n in files if not n.endswith(FRAME_SUFFIXES)}
         if earlier.solution is not None and not earlier.update:
-            # It is the same in all files of its detector.
+            # The same for all files of its detector.
             self._mine |= set(self._shared)
 
     def _others(self, earlier, groups, rows):
-        """Frames that an earlier run has done, that are not given now, and that stay."""
+        """Frames of an earlier run that are not given now and are kept."""
         given = {frame.name for group in groups for frame in group}
         written = {name for g in groups if not self.is_done(g) for name in self._names[g[0].name]}
         if earlier.solution is not None and not earlier.update:
@@ -285,7 +285,7 @@ class ResultFolder:
         return others
 
     def is_done(self, group):
-        """Return whether frames were done by the run that is resumed, and are left out.
+        """Return whether the resumed run has done these frames.
 
         Parameters
         ----------
@@ -295,24 +295,24 @@ class ResultFolder:
         Returns
         -------
         bool
-            If so, `load` gives what was found.
+            True if `load` can read their results.
         """
         return group[0].name in self._done
 
     def load(self, group, *, keep=True):
-        """Read what is done already.
+        """Read the results of finished frames.
 
         Parameters
         ----------
         group : list of Frame
             Frames for which `is_done` is true.
         keep : bool, optional
-            Whether calibrations are returned, or read to see that they are whole, and forgotten.
+            Whether to return calibrations, or only to check that their files are complete.
 
         Returns
         -------
         Outcome
-            As it was written.
+            Outcome as written.
 
         Raises
         ------
@@ -352,14 +352,14 @@ class ResultFolder:
         return outcome
 
     def write(self, group, outcome):
-        """Write what was found of some frames: all of it, or nothing.
+        """Write the outcome of some frames completely or not at all.
 
         Parameters
         ----------
         group : list of Frame
             The frames.
         outcome : Outcome
-            What was found.
+            Their results.
 
         Raises
         ------
@@ -368,7 +368,7 @@ class ResultFolder:
         """
         part = self.folder / f".{self._manifest.run}.part"
         try:
-            # What an earlier group has left of it when it could not be written.
+            # Remains of an earlier group that could not be written.
             shutil.rmtree(part, ignore_errors=True)
             part.mkdir()
             files, shared = self._write_into(part, group, outcome)
@@ -396,7 +396,7 @@ class ResultFolder:
                     self._require_free(path.name)
             part.rename(part.with_suffix(".done"))
         except InputError as err:
-            # Nobody knows the hidden folder, which is gone by then.
+            # Do not name the hidden folder, which is removed.
             raise InputError(str(err).replace(str(part), str(self.folder))) from err
         except OSError as err:
             raise InputError(f"{self.folder}: cannot be written to: {err.strerror or err}") from err
@@ -405,7 +405,7 @@ class ResultFolder:
         put_in_place(part.with_suffix(".done"), self.folder)
 
     def _write_into(self, part, group, outcome):
-        """Write results into a folder: the files of each frame, and those that they share."""
+        """Write results into a folder: files of each frame, and shared files."""
         from wpdc_gwcs.io import write, write_table
 
         run = self._manifest.run
@@ -419,7 +419,7 @@ class ResultFolder:
                     files[calibration.frame].append(name)
             write(_of_run(calibration, run), part / f"{calibration.frame}.wcs.asdf")
             files[calibration.frame].append(f"{calibration.frame}.wcs.asdf")
-        # What several frames share; of a stored solution it is the same in all batches.
+        # Shared files; with a stored solution they are the same in all batches.
         shared = {f"{file_stem(s.detector)}.solution.asdf": s for s in outcome.solutions.values()}
         shared |= {superseded_name(s): s for s in outcome.superseded.values()}
         camera_name = next(
@@ -434,8 +434,8 @@ class ResultFolder:
             if n_detectors > self._shared.get(name, 0):
                 write(_of_run(one, run), part / name)
                 self._shared[name] = n_detectors
-        # What an earlier run left for a frame that now fails, or has no sources of its own, would
-        # pass for its own.
+        # Files of an earlier run for a frame that now fails, or has no sources, would seem to be
+        # from this run.
         removed = [
             frame.name + suffix
             for frame in group
@@ -446,19 +446,19 @@ class ResultFolder:
         return files, list(shared)
 
     def log(self, name, error):
-        """Keep the details of an internal error.
+        """Append the details of an internal error to a file.
 
         Parameters
         ----------
         name : str
-            Frame.
+            Name of the frame.
         error : InternalError
-            Where it happened.
+            The error with its details.
 
         Returns
         -------
         Path
-            The file that they are in, after what is there already.
+            The file.
         """
         path = self.folder / ERRORS
         with path.open("a", encoding="utf-8", errors="backslashreplace") as file:
@@ -467,7 +467,7 @@ class ResultFolder:
 
 
 def _of_run(result, run):
-    """Return a result or table the identity of its run."""
+    """Add the identity of the run to a result or table."""
     if isinstance(result, Table):
         marked = result.copy(copy_data=False)
         marked.meta["run"] = run
@@ -476,7 +476,7 @@ def _of_run(result, run):
 
 
 def _write_state(folder, manifest, rows):
-    """Write the summary and the manifest, each as a whole."""
+    """Write the summary and the manifest, each atomically."""
     from wpdc_gwcs.io import atomic_path, write_table
 
     done = [rows[name] for name in manifest.frames if name in rows]
@@ -486,7 +486,7 @@ def _write_state(folder, manifest, rows):
 
 
 def _read_rows(path, run):
-    """Rows of the summary of a run, by frame; none if it is of another run."""
+    """Rows of the summary by frame; none if it is from another run."""
     from wpdc_gwcs.io import read_table
 
     if not path.exists():

@@ -67,19 +67,19 @@ class CalibrationRun:
         One for each solved frame, in the order of the input; empty if they are only written to
         files.
     solutions : dict
-        Detector name to `DistortionSolution`.
+        `DistortionSolution` of each detector, by name.
     failures : dict
-        Frame name to the error that kept it from being solved.
+        Error of each frame that could not be solved, by name.
     summary : `~astropy.table.QTable`
         One row per frame: status, reason, counts, residual statistics, seconds.
     superseded : dict
-        Detector name to the stored solution, valid until then, of a detector that has changed.
+        Previous solution of each detector that has changed, by name.
     cameras : tuple of `Camera`
         One for each group of detectors that were solved together.
     run_id : str
         Identifier of the run, which is in all its files.
     resumed : tuple of str
-        Frames that an earlier run had done, whose results were read from its files.
+        Frames of an earlier run whose results were read from its files.
     """
 
     calibrations: tuple
@@ -135,9 +135,9 @@ def calibrate(
     settings : Settings, optional
         Options; the defaults work for any camera.
     jobs : int, optional
-        Processes in which frames are measured and matched.
+        Number of processes that measure and match frames.
     executor : concurrent.futures.Executor, optional
-        Where frames are measured and matched instead, for example
+        Executor that measures and matches frames instead, for example
         ``dask.distributed.Client(...).get_executor()``.  Each frame is sent with the part of the
         catalog that it needs.
     output : path-like, optional
@@ -259,7 +259,7 @@ def calibrate(
 
 
 def _as_frames(frames):
-    """Frames of one or of any iterable, with names of their own."""
+    """List of one or more frames, with unique names."""
     frames = [frames] if isinstance(frames, Frame) else list(frames)
     if not frames:
         raise ValueError("calibrate needs at least one frame")
@@ -279,10 +279,10 @@ def _as_frames(frames):
 
 
 def _outcomes(groups, run, workers):
-    """Yield each group and what is found of it; those behind it are matched in the meantime.
+    """Yield each group with its outcome, while the next groups are being matched.
 
-    No more than keeps the workers busy is in hand, so that memory does not grow with the run.
-    Where a cluster or the archive of the catalog is lost, what was begun comes before the error.
+    Only as many tasks as keep the workers busy are started, so that memory does not grow with the
+    run.  If a cluster or the archive of the catalog is lost, the started groups come first.
     """
     other = _of_other_detectors(run.frames, run.solution)
     counter, n_frames = itertools.count(1), sum(map(len, groups))
@@ -290,7 +290,7 @@ def _outcomes(groups, run, workers):
     waiting, begun, lost = deque(groups), deque(), None
 
     def begin():
-        """Have the next groups matched, the first of them in any case."""
+        """Start the matching of the next groups, at least one."""
         nonlocal lost
         while waiting and lost is None:
             in_hand = sum(len(work.tasks) for work in begun)
@@ -331,7 +331,7 @@ def _outcomes(groups, run, workers):
 
 
 def _outcome_of(work, results, run, workers):
-    """Match what could not be matched alone, where there are workers for it, and solve."""
+    """Match frames that could not be matched alone, and solve."""
     group = work.group
     try:
         if workers is not None:
@@ -388,7 +388,7 @@ def _solve_group(work, results, run):
 
 
 def _log_details(name, error, folder):
-    """Keep where an internal error happened, in a file where there is a folder."""
+    """Log the details of an internal error, in a file if there is a folder."""
     if not isinstance(error, InternalError):
         return
     if folder is None:
@@ -398,7 +398,7 @@ def _log_details(name, error, folder):
 
 
 def _joined(frames, outcomes, run_id, resumed):
-    """Return the result of a run from those of its groups."""
+    """Combine the outcomes of groups to the result of a run."""
     calibrations = {c.frame: c for outcome in outcomes for c in outcome.calibrations}
     rows = {row["frame"]: row for outcome in outcomes for row in outcome.rows}
     joined = {
@@ -415,12 +415,12 @@ def _joined(frames, outcomes, run_id, resumed):
     )
 
 
-# Detectors named in a message.
+# Maximum number of detectors named in a message.
 _MOST_NAMED = 6
 
 
 def _of_other_detectors(frames, solution):
-    """Fail all frames if not one of the stored solutions is of a detector of theirs."""
+    """Fail all frames if no stored solution belongs to any of their detectors."""
     if not isinstance(solution, Mapping) or {f.detector for f in frames} & set(solution):
         return {}
     names = [repr(name) for name in solution]
@@ -439,7 +439,7 @@ def _of_other_detectors(frames, solution):
 
 
 def _named_apart(frames):
-    """Frames whose detectors have different names where they are of different cameras."""
+    """Frames with different names for detectors of different cameras."""
     cameras = {}
     for frame in frames:
         cameras.setdefault(frame.detector, set()).add(frame.camera)
@@ -463,7 +463,7 @@ def _camera_of(group, solutions, calibrations):
 
 
 def _holdout_mask(catalog, settings):
-    """Rows of the catalog that are kept out of every fit, the same in all frames."""
+    """Rows of the catalog that are held out of every fit, the same in all frames."""
     if settings.holdout == 0:
         return None
     size = int(np.max(catalog["catalog_index"], initial=-1)) + 1

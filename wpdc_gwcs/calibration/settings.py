@@ -1,4 +1,4 @@
-"""Choices of a calibration."""
+"""Settings of a calibration."""
 
 import math
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _CHOICES = {
 
 @dataclass(frozen=True)
 class Settings:
-    """Choices of a calibration; the defaults work for any camera.
+    """Settings of a calibration; the defaults work for any camera.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Settings:
         Electrons per count, and counts at which pixels are saturated, instead of the values in the
         headers.
     holdout : float, optional
-        Share of the reference stars, 0 to 0.9, kept out of every fit and evaluated separately.
+        Fraction of the reference stars, 0 to 0.9, held out of every fit and evaluated separately.
     free_stars : bool, optional
         Fit the positions of reference stars that are in several exposures, with the errors of the
         catalog as priors; for catalogs that are less accurate than the camera.
@@ -147,7 +147,7 @@ class Settings:
         Returns
         -------
         RadialWeight
-            With the radius chosen, or the default one of the detector.
+            Weight with the chosen radius, or the default one for the detector.
         """
         if self.r0 is None:
             return RadialWeight.for_shape(image_shape, self.weight)

@@ -1,4 +1,4 @@
-"""What a run has done, stage by stage, in words: for ``-v`` and ``wpdc explain``."""
+"""Description of a run in words, stage by stage, for ``-v`` and ``wpdc explain``."""
 
 import logging
 from collections import Counter
@@ -28,7 +28,7 @@ _GAIN = {
     "header": "from the header, confirmed by the noise",
     "noise": "from the noise in its stars",
 }
-# What a catalog may have besides positions, and how it is called.
+# Optional columns of a catalog, and their names in words.
 _COLUMNS = {
     "pmra": "proper motions",
     "parallax": "parallaxes",
@@ -39,12 +39,12 @@ _COLUMNS = {
 
 
 def say(tell, *what):
-    """Log the lines of a stage, which nobody makes where nobody reads them.
+    """Log the lines of a stage; they are made only if they are logged.
 
     Parameters
     ----------
     tell : callable
-        Makes the lines.
+        Function that returns the lines.
     *what
         Its arguments.
     """
@@ -54,14 +54,14 @@ def say(tell, *what):
 
 
 def tell_frames(frames, groups):
-    """Say what was read.
+    """Describe the frames.
 
     Parameters
     ----------
     frames : list of Frame
         All frames.
     groups : list of list of Frame
-        Those that are solved together.
+        Frames that are solved together.
 
     Returns
     -------
@@ -80,12 +80,12 @@ def tell_frames(frames, groups):
 
 
 def tell_catalog(catalog, seconds):
-    """Say what the reference catalog has.
+    """Describe the reference catalog.
 
     Parameters
     ----------
     catalog : `~astropy.table.Table`
-        As read, or the part of it that is needed.
+        The catalog, or the needed part of it.
     seconds : float
         How long it took.
 
@@ -102,21 +102,21 @@ def tell_catalog(catalog, seconds):
 
 
 def tell_sources(sources, frame, settings):
-    """Say what was measured on a frame, and what takes part.
+    """Describe the sources of a frame, and which are used.
 
     Parameters
     ----------
     sources : `~astropy.table.Table`
         As from `measure_sources`.
     frame : Frame
-        Its shape counts.
+        The frame, for its shape.
     settings : Settings
-        What sources are judged by.
+        Settings, with the criteria for sources.
 
     Returns
     -------
     list of str
-        Counts, and of an image FWHM and gain.
+        Counts, and for an image FWHM and gain.
     """
     rules = rules_of(sources, frame, settings)
     usable = int(np.sum(~np.any(list(rules.values()), axis=0)))
@@ -131,17 +131,17 @@ def tell_sources(sources, frame, settings):
 
 
 def tell_match(found):
-    """Say how a frame was matched, and how sure that is.
+    """Describe the match of a frame and its evidence.
 
     Parameters
     ----------
     found : MatchDiagnostics
-        Of the match.
+        Diagnostics of the match.
 
     Returns
     -------
     list of str
-        Pairs and evidence, what the header was off by, what was left out.
+        Pairs and evidence, errors of the header, sources left out.
     """
     return [
         f"{counted(found.n_pairs, 'pair')}, {found.expected_by_chance:.1f} expected by chance "
@@ -155,7 +155,7 @@ def tell_match(found):
 
 
 def tell_result(frame, result, settings):
-    """Say what became of a frame before it is solved.
+    """Describe the measurement and match of a frame.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def tell_result(frame, result, settings):
 
 
 def tell_solution(solution):
-    """Say what the solver has chosen for a detector.
+    """Describe the solution of a detector.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def tell_solution(solution):
 
 
 def tell_outcome(outcome, seconds):
-    """Say what became of frames that were solved together.
+    """Describe the outcome of frames that were solved together.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The summary of a run: one row per frame, whatever became of it."""
+"""The summary of a run: one row per frame, solved or not."""
 
 import numpy as np
 from astropy.table import QTable
@@ -11,25 +11,25 @@ _UNITS = {"rms_mas": "mas", "seconds": "s", "fwhm": "pix", "epoch": "yr"}
 
 
 def summary_row(frame, result, calibration, failure, settings):
-    """Tell what became of a frame.
+    """Build the row of a frame.
 
     Parameters
     ----------
     frame : Frame
         The frame.
     result : MatchedFrame or FailedFrame
-        Its match.
+        Match of the frame.
     calibration : Calibration or None
-        What was found.
+        Result of the frame.
     failure : WPDCError or None
-        Or why nothing was.
+        Reason of a failure.
     settings : Settings
-        What sources were judged by.
+        Settings, with the criteria for sources.
 
     Returns
     -------
     dict
-        Column to value.
+        Values by column.
     """
     statistics = {} if calibration is None else calibration.statistics
     row = {
@@ -63,19 +63,19 @@ def summary_row(frame, result, calibration, failure, settings):
 
 
 def summarize(rows, run_id):
-    """Make a table of rows.
+    """Build a table from rows.
 
     Parameters
     ----------
     rows : list of dict
-        What `summary_row` returned; at least one.
+        Rows as from `summary_row`; at least one.
     run_id : str
         Identity of the run, for the metadata.
 
     Returns
     -------
     `~astropy.table.QTable`
-        With units.
+        Table with units.
     """
     table = QTable(rows, meta={"run": run_id})
     for name in table.colnames:

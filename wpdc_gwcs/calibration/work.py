@@ -1,4 +1,4 @@
-"""Frames in work: what they share, their part of the catalog, and how each of them is matched.
+"""Work in progress: frames, their part of the catalog, and their matching.
 
 ::
 
@@ -25,21 +25,21 @@ __all__ = ["InWork", "Run", "begin_group", "match_group", "sky_of_frames"]
 
 
 def sky_of_frames(frames, settings, solution):
-    """Tell what part of the sky frames cover.
+    """Return the part of the sky that frames cover.
 
     Parameters
     ----------
     frames : list of Frame
         The frames.
     settings : Settings
-        A blind search needs more.
+        Settings; a blind search needs a larger region.
     solution : DistortionSolution, mapping or None
         Stored solutions.
 
     Returns
     -------
     Region or None
-        None where none of them tells.
+        None if no frame has a position.
     """
     cones = [
         sky_of_frame(frame, settings, solution=stored_of(solution, frame.detector))
@@ -51,18 +51,18 @@ def sky_of_frames(frames, settings, solution):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What all frames of a run share.
+    """Common data of all frames of a run.
 
     Parameters
     ----------
     frames : list of Frame
-        All of them.
+        All frames.
     catalog : `~astropy.table.Table`, GaiaArchive or HatsCatalog
-        Reference stars about all frames, or what parts of it are read from.
+        Reference stars around all frames, or the source to read parts from.
     solution : DistortionSolution, mapping or None
         Stored solutions.
     settings : Settings
-        Choices.
+        Settings.
     update : bool
         Whether stored solutions are updated.
     progress : callable
@@ -87,14 +87,14 @@ class Run:
         Returns
         -------
         `~astropy.table.Table`
-            Of an archive, no more than they cover.
+            For an archive, only the part that the frames cover.
         """
         if not hasattr(self.catalog, "stars_of"):
-            # Of all frames, its motions filled from the whole: a star moves alike in all of them.
+            # Motions are filled in from the whole, so that a star moves the same way in all frames.
             return self.catalog
         sky = sky_of_frames(group, self.settings, self.solution)
         if sky is None:
-            # They fail by themselves, whatever the catalog.
+            # These frames fail with any catalog.
             cones = (sky_of_frames([f], self.settings, self.solution) for f in self.frames)
             sky = next((cone for cone in cones if cone is not None), None)
         began = time.perf_counter()
@@ -105,16 +105,16 @@ class Run:
 
 @dataclass(eq=False)
 class InWork:
-    """Frames that are solved together, and what is under way for them.
+    """Frames that are solved together, and their tasks in progress.
 
     Parameters
     ----------
     group : list of Frame
         The frames.
     catalog : `~astropy.table.Table` or None
-        Their part of the catalog; none where all of them have failed already.
+        Their part of the catalog; None if all of them have failed.
     tasks : dict
-        Frame name to what returns its result.
+        Functions that return the results, by frame name.
     """
 
     group: list
@@ -123,23 +123,23 @@ class InWork:
 
 
 def begin_group(group, run, workers, other):
-    """Have the frames of a group matched.
+    """Start the matching of a group.
 
     Parameters
     ----------
     group : list of Frame
         The frames.
     run : Run
-        What they share with the others.
+        Common data of the run.
     workers : Workers
-        Who does it.
+        Workers for the tasks.
     other : dict
-        Results of frames that have failed already: then there is nothing to do.
+        Results of frames that have failed already.
 
     Returns
     -------
     InWork
-        What is under way.
+        Tasks in progress.
     """
     if other:
         return InWork(group, None, {})
@@ -148,10 +148,10 @@ def begin_group(group, run, workers, other):
 
 
 def _submit(group, catalog, run, workers, *, narrow, sources=None):
-    """Have frames matched alone: frame name to what will return the result.
+    """Start the matching of single frames; return functions for the results by frame name.
 
-    A blind search takes ten times as long, above all to find nothing: in an exposure of several
-    detectors it is left for those that neither they themselves nor their neighbors could match.
+    A blind search takes ten times as long, especially without a match: in an exposure of several
+    detectors it is used only for frames that match neither alone nor through their neighbors.
     """
     settings = replace(run.settings, blind=False) if narrow else run.settings
     tied = _tied(group) if narrow else ()
@@ -184,16 +184,16 @@ def match_group(work, results, run, workers):
     work : InWork
         The frames.
     results : dict
-        Frame name to `MatchedFrame` or `FailedFrame`.
+        `MatchedFrame` or `FailedFrame` by frame name.
     run : Run
-        What they share with the others.
+        Common data of the run.
     workers : Workers
-        Who does it.
+        Workers for the tasks.
 
     Returns
     -------
     dict
-        As ``results``, with more matched frames.
+        Like ``results``, with more matched frames.
     """
     group, catalog = work.group, work.catalog
     find = partial(start_from_neighbors, solution=run.solution)

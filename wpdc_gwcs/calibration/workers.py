@@ -1,12 +1,11 @@
-"""Where frames are measured and matched: here, in processes of our own, or in an executor.
+"""Workers that measure and match frames: this process, other processes, or an executor.
 
 ::
 
     Task --submit--> (this process | process of a thread | executor) --> MatchedFrame or FailedFrame
 
-Each process is driven by a thread and talks to it through a pipe: it ends when the pipe or the
-parent does, whatever ends the parent, and a process that dies takes nothing with it but the frame
-that it had.
+Each process is driven by a thread through a pipe.  It ends when the pipe or the parent ends, for
+whatever reason.  A process that dies affects only its current frame.
 """
 
 import contextlib
@@ -46,19 +45,19 @@ from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["Task", "Workers", "internal_error", "stored_of"]
 
-# A process may die of something that passes, memory that others took for example.
+# A process may die for a temporary reason, for example memory used by others.
 _TRIES = 2
-# Tasks in hand for each that works on them: none waits for work, few results for their turn.
+# Tasks per worker: no worker is idle, and few results have to wait.
 _IN_HAND = 2
-# Those who work for an executor that does not tell how many they are.
+# Assumed number of workers of an executor that does not tell it.
 _WORKERS = 32
-# Processes that are killed end at once; one that does not in this time, s, is left to the system.
+# Seconds to wait for the end of a killed process, after which it is left to the system.
 _PATIENCE = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A frame to be matched, how and against what; its sources where they have been measured."""
+    """A frame to match with its settings and catalog, and its sources if already measured."""
 
     frame: Frame
     settings: Settings
@@ -67,12 +66,12 @@ class Task:
     sources: Table | None = None
 
     def alone(self):
-        """Task that carries no more of the catalog than it needs.
+        """Return the task with only the needed part of the catalog.
 
         Returns
         -------
         Task
-            With the same result.
+            Task with the same result.
         """
         stored = stored_of(self.solution, self.frame.detector)
         near = catalog_of_frame(self.frame, self.catalog, self.settings, solution=stored)
@@ -80,35 +79,35 @@ class Task:
 
 
 def stored_of(solution, detector):
-    """Pick the stored solution of a detector: solutions come alone or by detector.
+    """Select the stored solution of a detector from one or many.
 
     Parameters
     ----------
     solution : DistortionSolution, mapping or None
-        One or many.
+        One solution, or solutions by detector.
     detector : str
         Name of the detector.
 
     Returns
     -------
     DistortionSolution or None
-        None where there is none.
+        None if there is none.
     """
     return solution.get(detector) if isinstance(solution, Mapping) else solution
 
 
 def internal_error(problem):
-    """Error of a frame in which something happened that nobody thought of.
+    """Return the error of a frame for an unexpected exception.
 
     Parameters
     ----------
     problem : Exception
-        What happened.
+        The exception.
 
     Returns
     -------
     InternalError
-        Its ``details`` are the traceback.
+        Error whose ``details`` are the traceback.
     """
     text = " ".join(str(problem).split())
     return InternalError(
@@ -129,7 +128,7 @@ def match_or_fail(task):
     Returns
     -------
     MatchedFrame or FailedFrame
-        Whatever happens.
+        The result, in any case.
     """
     began = time.perf_counter()
     frame, sources = task.frame, task.sources
@@ -144,13 +143,13 @@ def match_or_fail(task):
     except Exception as problem:  # noqa: BLE001  One frame is not to end the run of all.
         error = internal_error(problem)
     n_sources = 0 if sources is None else len(sources)
-    # Nobody can tell what is wrong with sources that met an internal error.
+    # The sources may be the cause of an internal error.
     kept = None if isinstance(error, InternalError) else sources
     return FailedFrame(without_frames(error), n_sources, time.perf_counter() - began, kept)
 
 
 def _stored_for(solution, frame):
-    """Find the stored solution of a frame, and refuse one of another detector."""
+    """Find the stored solution of a frame; raise an error if it is for another detector."""
     solution = stored_of(solution, frame.detector)
     if solution is not None and tuple(solution.image_shape) != tuple(frame.image_shape):
         raise FitError(
@@ -167,14 +166,14 @@ def _stored_for(solution, frame):
 
 
 class Workers:
-    """Where tasks are done; a context manager, whose end is the end of all that it has begun.
+    """Workers as a context manager; at its end, everything that it started ends.
 
     Parameters
     ----------
     jobs : int
-        Processes; 1 for none but this one.
+        Number of processes; 1 for this process only.
     executor : concurrent.futures.Executor, optional
-        Where tasks are done instead.
+        Executor for the tasks instead.
     """
 
     def __init__(self, jobs, executor=None):
@@ -187,7 +186,7 @@ class Workers:
         self._futures = set()
         if executor is None and jobs > 1:
             if hasattr(signal, "pthread_sigmask"):
-                # Else the first process to be started starts it, and hears Ctrl-C thereafter.
+                # Otherwise the first new process would start it, and then receive Ctrl-C.
                 resource_tracker.ensure_running()
             self._threads = ThreadPoolExecutor(jobs, initializer=_ignore_interrupts)
 
@@ -205,13 +204,13 @@ class Workers:
 
     @property
     def in_hand(self):
-        """How many tasks should be in hand, so that nobody waits for one."""
+        """Number of tasks to start so that no worker is idle."""
         if self._executor is not None:
             return _IN_HAND * getattr(self._executor, "n_workers", _WORKERS)
         return _IN_HAND * self._jobs if self._threads is not None else 0
 
     def submit(self, task):
-        """Have a task done.
+        """Start a task.
 
         Parameters
         ----------
@@ -221,12 +220,12 @@ class Workers:
         Returns
         -------
         callable
-            Returns the `MatchedFrame` or `FailedFrame`, when it is there.
+            Waits for the `MatchedFrame` or `FailedFrame` and returns it.
 
         Raises
         ------
         ClusterError
-            If the executor has nobody left to do it; the same by the callable.
+            If the executor has no workers left; also raised by the callable.
         """
         if self._threads is not None:
             future = self._threads.submit(self._in_process, task)
@@ -246,12 +245,12 @@ class Workers:
         try:
             answer = future.result()
         except ClusterError:
-            # Nobody is there to do the other frames either.
+            # There are no workers for other frames either.
             raise
         except Exception as problem:  # noqa: BLE001  Such as the death of a worker of an executor.
             return FailedFrame(internal_error(problem), 0, 0.0)
         finally:
-            # It would keep what is asked for once.
+            # The future would keep the result.
             self._futures.discard(future)
         if self._threads is None:
             return answer
@@ -261,7 +260,7 @@ class Workers:
         return result
 
     def _in_process(self, task):
-        """Done by a thread: hand the task to its process, a new one where that has died."""
+        """Hand a task to the process of this thread, or to a new one if that has died."""
         try:
             message = ForkingPickler.dumps(task.alone())
         except (TypeError, AttributeError, ValueError) as problem:
@@ -294,8 +293,8 @@ class Workers:
 
 
 def _ignore_interrupts():
-    # Ctrl-C goes to all processes of a terminal.  Those that are started by this thread inherit
-    # that they do not hear it, from their first moment on, and end with their parent.
+    # Ctrl-C goes to all processes of a terminal.  Processes started by this thread inherit that it
+    # is blocked, and end with their parent.
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
@@ -315,7 +314,7 @@ class _Process:
         return self._pipe.recv()
 
     def end(self):
-        """End the process, and tell its exit status."""
+        """End the process, and return its exit status."""
         self._process.kill()
         self._process.join(_PATIENCE)
         with contextlib.suppress(OSError):
@@ -324,7 +323,7 @@ class _Process:
 
 
 def _serve(pipe):
-    """Work of a process, until its parent or the pipe ends."""
+    """Match frames until the parent or the pipe ends."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
         while True:
@@ -332,12 +331,12 @@ def _serve(pipe):
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
                 result = match_or_fail(task)
-            # Ours are about the user's data; those of libraries are about code.
+            # Our own warnings are about the user's data; those of libraries are about code.
             ours = [w.message for w in caught if issubclass(w.category, WPDCWarning)]
             pipe.send((result, ours))
 
 
 def _end_with_parent():
-    """Wait for the end of the parent, which may come in the middle of our work."""
+    """Exit when the parent ends, even in the middle of the work."""
     connection.wait([parent_process().sentinel])
     os._exit(1)
