@@ -40,8 +40,8 @@ class Manifest:
         Path, size and time of each input file.
     frames : dict
         For each frame ``detector``, ``camera``, ``exposure``, ``input`` (checksum of its inputs),
-        ``group`` (number of its group, which is solved together), ``state`` (``pending``, ``solved``,
-        ``degraded`` or ``failed``) and, once it is done, ``error`` (class of the failure) and
+        ``group`` (number of its group, which is solved together), ``state`` (``pending``,
+        ``solved``, ``degraded`` or ``failed``) and, once it is done, ``error`` (class of the failure) and
         ``files``.
     """
 
