@@ -41,8 +41,8 @@ class Manifest:
     frames : dict
         For each frame ``detector``, ``camera``, ``exposure``, ``input`` (checksum of its inputs),
         ``group`` (number of its group, which is solved together), ``state`` (``pending``,
-        ``solved``, ``degraded`` or ``failed``) and, once it is done, ``error`` (class of the failure) and
-        ``files``.
+        ``solved``, ``degraded`` or ``failed``) and, once it is done, ``error`` (class of the
+        failure) and ``files``.
     """
 
     run: str
