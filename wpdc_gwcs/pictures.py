@@ -179,7 +179,7 @@ def _sources(panel, sources, usable, shape):
         shape = (int(np.nanmax(y)) + 1, int(np.nanmax(x)) + 1)
     out = f"{np.sum(~usable)} left out"
     panel.plot(x[~usable], y[~usable], "x", ms=4, color=_ORANGE, label=out)
-    label = f"{np.sum(usable)} take part"
+    label = f"{np.sum(usable)} used"
     panel.plot(x[usable], y[usable], "o", ms=3, mfc="none", color=_BLUE, label=label)
     _detector(panel, shape, f"{len(x)} sources")
     panel.legend(loc="upper right", framealpha=0.9, fontsize=8)

@@ -84,7 +84,7 @@ def start_from_neighbors(frames, results, catalog, settings=None, *, solution=No
 
     Notes
     -----
-    Only frames with a camera and an exposure take part.  A frame that is still not matched keeps
+    Only frames with a camera and an exposure are used.  A frame that is still not matched keeps
     the reason that it had.
     """
     settings = Settings() if settings is None else settings

@@ -36,7 +36,7 @@ def count_terms(order):
 
 
 def _columns(order, narrow):
-    """Columns of the design that take part, and their degrees; `narrow` is the axis or None."""
+    """Columns of the design that are used, and their degrees; `narrow` is the axis or None."""
     powers = np.array([(n - q, q) for n in range(order + 1) for q in range(n + 1)])
     use = np.ones(len(powers), bool) if narrow is None else powers[:, narrow] <= 1
     return np.flatnonzero(use), powers.sum(axis=1)[use]

@@ -70,7 +70,7 @@ class ExposurePolynomial:
 
     @property
     def used(self):
-        """Pairs that take part in the fit: allowed and finite."""
+        """Pairs used in the fit: allowed and finite."""
         return _usable(self.exposure)
 
     def variance(self, x, y):
