@@ -29,7 +29,7 @@ _PIXELS = 7_000_000
 # and that much there is.
 _ROOM = 300_000
 _BY_CHANCE = 0.03
-# Of so many rows one tells how many pixels sources have.
+# One in this many rows is used to estimate the number of pixels of sources.
 _SAMPLED = 4
 
 # Sources that tell the size of the stars.
@@ -48,7 +48,7 @@ def extract_peaks(background, threshold, deblend_contrast, fwhm=0.0):
     deblend_contrast : float
         Least share of the flux of a peak within a larger source.
     fwhm : float, optional
-        Of the stars, px; broad ones are looked for with a filter as broad.
+        FWHM of the stars, px; broad stars are searched with an equally broad filter.
 
     Returns
     -------
@@ -118,7 +118,7 @@ def is_broad(fwhm):
     Parameters
     ----------
     fwhm : float
-        Of the stars, px.
+        FWHM of the stars, px.
 
     Returns
     -------

@@ -80,7 +80,7 @@ def mask_hits(background, *, overwrite=False):
     )
     pairs = 0.5 * (beside + against)
     if background.mask is not None:
-        # Of a pair with a bad pixel the other says nothing: the star may be beside it.
+        # If one pixel of a pair is bad, the other says nothing: the star may be on the bad side.
         for sign in (1, -1):
             for pair, (j, i) in zip(pairs, _DIRECTIONS, strict=True):
                 pair[background.mask[y + sign * j, x + sign * i]] = np.inf

@@ -29,7 +29,7 @@ def window(x, y, xc, yc, half, sigma):
     half : int
         The cut-outs are 2 half + 1 px wide.
     sigma : float
-        Of the window, px.
+        Width of the window, px.
 
     Returns
     -------
@@ -55,7 +55,7 @@ def sizes(pixels, dx, dy, weight, sigma):
     dx, dy, weight : ndarray
         As from `window`.
     sigma : float
-        Of the window, px.
+        Width of the window, px.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, full):
     xpeak, ypeak : (N,) ndarray of int
         Brightest pixels.
     fwhm : float
-        Of the stars, px.
+        FWHM of the stars, px.
     gain : float or None
         Electrons per unit of the background.
     full : (ny, nx) ndarray of bool or None
@@ -168,7 +168,7 @@ def daofind_shape(image, xpeak, ypeak, sigma):
     xpeak, ypeak : (N,) ndarray of int
         Peaks.
     sigma : float
-        Of the stars, px.
+        Width of the stars, px.
 
     Returns
     -------

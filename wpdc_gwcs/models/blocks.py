@@ -97,8 +97,8 @@ def evaluate_blocks(function, *inputs, n_outputs=2):
     Returns
     -------
     outputs : tuple of ndarray
-        Of the broadcast shape of the inputs (zero-dimensional for scalars).  Masked arrays, of
-        numpy or of astropy, if an input is one.
+        Outputs with the broadcast shape of the inputs (zero-dimensional for scalars); masked arrays
+        of numpy or of astropy if an input is one.
     """
     if all(isinstance(value, (float, int)) for value in inputs):
         # One point, as in a loop over objects: without all that follows.

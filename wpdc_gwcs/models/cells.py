@@ -69,7 +69,7 @@ class CellGrid:
         x_range, y_range : (float, float)
             First and last edge.
         coefficients : (2, n, n, ny, nx) ndarray
-            Of the cells, without the ring.
+            Coefficients of the cells, without the outer ring.
         smooth : bool
             Whether the first derivatives are continuous from cell to cell; they are into the ring.
 

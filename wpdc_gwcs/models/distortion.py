@@ -34,7 +34,7 @@ class DistortionCorrection(Model):
     pv : PVPolynomial, optional
         The polynomial; the identity by default.
     lookup_table : LookupTable, optional
-        What is subtracted after it; nothing by default.
+        Table that is subtracted after the polynomial; none by default.
     **kwargs
         ``name`` and ``meta`` of the model.
 
@@ -326,7 +326,7 @@ class DetectorToSky(Model):
         box : ((float, float), (float, float)), optional
             Smallest and largest x, smallest and largest y.
         fill_value : float, optional
-            What points outside the box are mapped to.
+            Value of points outside the box.
 
         Returns
         -------
@@ -405,7 +405,7 @@ class SkyToDetector(Model):
             Smallest and largest x, smallest and largest y.  Solutions up to 1e-6 px outside are
             moved to its edge.
         fill_value : float, optional
-            What both coordinates of points outside the box become, and those without an answer.
+            Value of both coordinates of points outside the box, and without a solution.
 
         Returns
         -------

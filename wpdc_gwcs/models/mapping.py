@@ -177,7 +177,7 @@ class PlaneMap:
             Smallest and largest x, smallest and largest y.  Solutions up to 1e-6 px outside are
             moved to its edge; those farther out are not accepted.
         fill_value : float, optional
-            What both coordinates of an answer outside the box become, and without an answer.
+            Value of both coordinates of a solution outside the box, and without a solution.
 
         Returns
         -------

@@ -26,7 +26,7 @@ class PVPolynomial(FittableModel):
     degree : int, optional
         Highest total degree, 1 to 7.
     radial : bool, optional
-        Whether the terms in ``r = hypot(xi, eta)`` (indices 3, 11, 23, 39) are there.  They are
+        Whether the terms in ``r = hypot(xi, eta)`` (indices 3, 11, 23, 39) exist.  They are
         read from headers, never fitted.
     name : str, optional
         Name of the model.

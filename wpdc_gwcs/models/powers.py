@@ -69,7 +69,7 @@ def fit_polynomial(points, values, degree, weights=None):
     degree : int
         Total degree.
     weights : (N,) ndarray, optional
-        Of the squares of the errors; all the same by default.
+        Weights of the squared errors; all the same by default.
 
     Returns
     -------

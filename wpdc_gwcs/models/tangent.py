@@ -241,7 +241,7 @@ class _SkyMap:
         matrix = np.radians(cd)
         self._to_plane = plane_map.transformed(matrix, -matrix @ crpix)
         self._tangent = kernels.tangent_numbers(crval, np.linalg.inv(cd), crpix)
-        # What was asked for last, and its function: a single point takes less than making it.
+        # The last request and its function: making it takes longer than a single point.
         self._last_to_sky = self._last_from_sky = (None, None)
 
     @cached_property

@@ -10,7 +10,7 @@ __all__ = ["MAX_DEGREE", "PVTerms", "pv_terms"]
 #: Highest degree of the TPV convention.
 MAX_DEGREE = 7
 
-# FITS index of the radial term r**s.  They stand between the polynomial terms, hence no formula.
+# FITS index of the radial term r**s.  They are between the polynomial terms: no formula.
 _RADIAL_INDEX = {1: 3, 3: 11, 5: 23, 7: 39}
 
 
