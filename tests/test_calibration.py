@@ -121,7 +121,7 @@ def test_stored_solution_of_another_shape_is_refused(simulation, catalog, run):
 def test_stored_solution_of_another_detector_is_refused(simulation, catalog, run):
     frame = replace(simulation.exposures[0].frame(), detector="other")
     found = calibrate(frame, catalog, solution=run.solutions["sim"])
-    assert "detector 'other', the stored solution of 'sim'" in str(found.failures[frame.name])
+    assert "detector 'other', the stored solution for 'sim'" in str(found.failures[frame.name])
 
 
 def test_stored_solution_that_does_not_fit(simulation, catalog, run):
