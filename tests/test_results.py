@@ -370,7 +370,8 @@ def test_a_scheduler_without_workers_is_given_up(inputs, tmp_path, capsys):
         assert "the Dask scheduler has no worker yet; waiting at most 2 s" in lines[0]
         assert lines[1:] == [
             f"wpdc: error: --scheduler {cluster.scheduler_address}: must have a worker within 2 s, "
-            f"has none; try: dask worker {cluster.scheduler_address}, on machines that see the files"
+            f"has none; try: dask worker {cluster.scheduler_address}, on machines that see the "
+            "files"
         ]
     assert command([*arguments, "--scheduler", "tcp://127.0.0.1:1"]) == 2
     assert "no Dask scheduler answers there" in capsys.readouterr().err
