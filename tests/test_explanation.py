@@ -242,3 +242,27 @@ def test_a_header_that_points_beside_the_catalog(sky):
     assert line.endswith("in reach, 0 on the frame by its header")
     assert any("the header may point elsewhere" in advice for advice in told.advice)
     assert not any("deeper" in advice for advice in told.advice)
+
+
+def test_the_command_tells_stages_status_and_advice(tmp_path, capsys):
+    """A frame that is solved has status 0 and a picture; one of another sky 1 and what to try."""
+    options = ["--size", "512", "--density", "60", "--distortion", "5", "--exposures", "1", "-q"]
+    for name, center in (("a", "120,30"), ("b", "200,-10")):
+        folder = str(tmp_path / name)
+        assert run(["simulate", "--output", folder, "--center", center, *options]) == 0
+    catalogs = [str(tmp_path / name / "sim-reference.fits") for name in "ab"]
+    frame, picture = str(tmp_path / "a" / "sim-01.fits"), tmp_path / "why.png"
+    capsys.readouterr()
+    assert run(["explain", frame, "--catalog", catalogs[0], "--output", str(picture)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    stages = [line[:10].strip() for line in lines if line[10:12] == "ok"]
+    assert stages == ["frame", "sources", "catalog", "match", "solution"]
+    assert "sim-01: solved" in lines
+    assert picture.stat().st_size > 10_000
+    assert run(["explain", frame, "--catalog", catalogs[1]]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert "sim-01: failed" in lines
+    assert any(line.startswith("try: use a catalog of this part of the sky: ") for line in lines)
+    assert run(["explain", frame, "--catalog", catalogs[0], "--output", str(picture)]) == 2
+    assert run(["explain", frame, "--catalog", catalogs[0], "--output", "why.txt"]) == 2
+    assert "must end with .png, .pdf or .svg" in capsys.readouterr().err
