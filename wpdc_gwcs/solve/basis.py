@@ -6,7 +6,7 @@ import numpy as np
 
 from wpdc_gwcs.solve.terms import legendre_products
 
-__all__ = ["BEND_DEGREES", "Basis", "patch"]
+__all__ = ["BEND_DEGREES", "Basis", "inner_products", "patch"]
 
 # The patch is this much larger than the part of the focal plane where stars are used: the waves
 # vanish at its rim.
@@ -85,11 +85,53 @@ class Basis:
         out[-2, 0] = out[-1, 1] = 1.0
         return out
 
+    def moving(self, kind="curl-free"):
+        """Along which axes the shapes move stars, ``(2, K)`` of bool; what does not is zero there.
+
+        Parameters
+        ----------
+        kind : {'curl-free', 'axes'}, optional
+            As of `shapes`.
+
+        Returns
+        -------
+        ndarray
+            First axis, second axis.
+        """
+        m = self.orders.shape[1]
+        p = sum(n + 1 for n in range(BEND_DEGREES[0], BEND_DEGREES[-1] + 1)) if self.bends else 0
+        waves = [(m, [1, 1])] if kind == "curl-free" else [(m, [1, 0]), (m, [0, 1])]
+        each = [*waves, (p, [1, 0]), (p, [0, 1]), (1, [1, 0]), (1, [0, 1])]
+        counts, axes = zip(*each)
+        return np.repeat(np.array(axes, bool), counts, axis=0).T
+
     def _bends(self, focal):
         if not self.bends:
             return np.zeros((0, focal.shape[1]))
         place = (focal - self.center[:, None]) / (self.half[:, None] / _PATCH)
         return legendre_products(*place, BEND_DEGREES[0], BEND_DEGREES[-1])
+
+
+def inner_products(shapes, moving):
+    """Products of shapes with each other, summed over stars and axes.
+
+    Parameters
+    ----------
+    shapes : (K, 2, N) ndarray
+        Displacements, weighted.
+    moving : (2, K) ndarray of bool
+        Along which axes they are not zero: products with zeros would be most of the work.
+
+    Returns
+    -------
+    (K, K) ndarray
+        Symmetric.
+    """
+    total = np.zeros((len(shapes), len(shapes)))
+    for a, mine in enumerate(map(np.flatnonzero, moving)):
+        own = shapes[mine, a]
+        total[np.ix_(mine, mine)] += own @ own.T
+    return total
 
 
 def patch(low, high, n_waves, *, bends=False):

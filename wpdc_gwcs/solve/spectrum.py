@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import lapack
 from scipy.optimize import minimize
 
-from wpdc_gwcs.solve.basis import BEND_DEGREES, Basis
+from wpdc_gwcs.solve.basis import BEND_DEGREES, Basis, inner_products
 
 __all__ = ["Products", "Spectrum", "learn_spectra", "pooled_spectrum", "products"]
 
@@ -185,8 +185,10 @@ def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
     r = residual.ravel()
     for kind in kinds:
         shapes = basis.shapes(focal, kind)
-        shapes = shapes.reshape(len(shapes), -1) * np.sqrt(w)
-        g, h = shapes @ shapes.T, shapes @ (np.sqrt(w) * r)
+        shapes *= np.sqrt(weight)
+        g = inner_products(shapes, basis.moving(kind))
+        shapes = shapes.reshape(len(shapes), -1)
+        h = shapes @ (np.sqrt(w) * r)
         if nuisance is not None:
             free = nuisance.reshape(-1, nuisance.shape[2])
             cross = (shapes @ (free * np.sqrt(w)[:, None])).T
