@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 from scipy.special import erf
+from scipy.stats import norm
 
 from wpdc_gwcs.centroids import build_epsf, fit_centroids, subtract_stars
+from wpdc_gwcs.centroids._blends import _log_odds
 from wpdc_gwcs.detection import detect_companions, detect_sources, subtract_background
 from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EXTENDED, FLAG_FIT_FAILED
 
@@ -84,6 +86,18 @@ def test_hidden_companions_are_told_from_single_stars():
     unlike = np.asarray(found["flags"]) & (FLAG_EXTENDED | FLAG_FIT_FAILED | FLAG_BLENDED) > 0
     assert unlike[hidden].mean() > 0.8
     assert unlike[~hidden].mean() < 0.04
+
+
+def test_odds_are_those_of_normal_likelihoods():
+    rng = np.random.default_rng(6)
+    known = rng.uniform(1, 60, (20, 5))
+    share = rng.normal(0, 3 / known)
+    light = 10 ** (-0.4 * np.linspace(0, 4, 9))
+    with_one = norm.pdf(share[:, :, None], light, 1 / known[:, :, None]).mean(axis=2)
+    ratio = (with_one / norm.pdf(share, 0, 1 / known)).mean(axis=1)
+    assert _log_odds(share, known) == pytest.approx(np.log(ratio), rel=1e-9)
+    # Stars so bright that likelihoods are no numbers any more.
+    assert _log_odds(np.array([[0.1]]), np.array([[1e4]]))[0] > 1e5
 
 
 def test_stars_of_many_colors_are_not_taken_for_pairs():

@@ -5,6 +5,7 @@ import pytest
 from scipy.special import erf
 
 from wpdc_gwcs.centroids import build_epsf, fit_centroids
+from wpdc_gwcs.centroids._build import _likely_amplitudes
 from wpdc_gwcs.centroids._profile import Profile
 from wpdc_gwcs.detection import detect_sources, subtract_background
 
@@ -83,6 +84,46 @@ def test_coma_that_grows_over_the_frame_is_followed():
     assert np.median(stated / limit) < 1.6
     assert 0.5 < scatter(error / stated) < 1.2
     assert len(error) > 400
+
+
+def test_stars_in_corners_are_not_led_by_noise_in_the_psf():
+    """Width varies over the frame and asymmetry does not, whatever the few stars there say."""
+    odd = []
+    # Frames whose noise looks like coma.
+    for seed in (15, 16):
+        rng = np.random.default_rng(seed)
+        y, x = (v.ravel() + rng.uniform(-9, 9, v.size) for v in np.mgrid[30:820:48, 30:820:48])
+        r2 = ((x - 420) ** 2 + (y - 420) ** 2) / 420**2
+        image = np.zeros(SHAPE)
+        for k in range(x.size):
+            spot(x[k], y[k], 10 ** rng.uniform(3.3, 5.3), 0.7 * (1 + 0.06 * r2[k]), image)
+        background = subtract_background(rng.poisson((image + SKY) * GAIN) / GAIN)
+        epsf = build_epsf(background, detect_sources(background, gain=GAIN), gain=GAIN)
+        grids = np.atleast_3d(epsf.data)
+        assert len(grids) > 1
+        difference = grids[[0, 4, 20, 24]] - grids[[0, 4, 20, 24], ::-1, ::-1]
+        odd.append(np.abs(difference).max() / grids.max() / 2)
+    assert max(odd) < 0.0015
+
+
+@pytest.mark.parametrize(("size", "expected"), [(0.0, 0.05), (0.02, 0.2), (0.3, 0.6)])
+def test_amplitudes_are_as_large_as_the_data_say(size, expected):
+    """Against the best linear estimate, which knows the size, and its error."""
+    rng = np.random.default_rng(1)
+    group = np.repeat([0, 1], 20)
+    square, best = [], []
+    for _ in range(200):
+        truth = np.where(group == 0, rng.normal(0, size, 40), 0)
+        factor = rng.normal(size=(120, 40))
+        normal, vector = factor.T @ factor, factor.T @ (factor @ truth + rng.normal(size=120))
+        found = _likely_amplitudes(normal, vector, group)
+        square.append((found - truth) @ (found - truth))
+        prior = np.diag(np.where(group == 0, 1 / max(size, 1e-5) ** 2, 1e10))
+        known = np.linalg.solve(normal + prior, vector)
+        best.append((known - truth) @ (known - truth))
+    plain = 40 / 80
+    assert np.mean(square) < np.mean(best) + 0.12 * plain
+    assert np.mean(square) < expected * plain
 
 
 @pytest.mark.parametrize(("sigma", "expected"), [(0.35, None), (0.8, 0.0)])

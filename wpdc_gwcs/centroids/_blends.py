@@ -12,11 +12,12 @@ __all__ = ["judge_profiles", "weigh_neighbors"]
 # Stars at a time: bounds the memory for their pixels.
 _CHUNK = 4000
 
-# Significance in sigma of the companion that is the most significant one, which one star in a
-# hundred exceed by noise, of any profile.  Where its share of the light is known better than the
-# next number, it is that times the fourth root of how much better: companions of a bright star show
-# far beyond, and bright stars are few.
-_MAX_COMPANION, _KNOWN = 3.15, 0.017
+# Companions looked for, in magnitudes fainter than the star; and the logarithm of the odds, all of
+# them against none, that one single star in a hundred exceeds by noise.  Where the share of their
+# light is known better than the last number, it is as many times larger: companions of a bright
+# star show far beyond, and bright stars are few.
+_FAINTER = np.linspace(0, 4, 9)
+_ODDS, _KNOWN = 1.3, 0.017
 # Stars nearest in place, and the best measured of all, that tell how profiles differ.
 _NEAREST, _BEST = 25, 300
 _LEAST = 20
@@ -122,8 +123,8 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     A companion nearer than the PSF is wide makes a star broader and one-sided: what is left of its
     light when position and flux of the star have taken up what they can.  That is, for the most
     part, a sum of the second and higher derivatives of the profile.  Their amplitudes are fitted,
-    what the nearest bright stars have in common is taken off, and of companions at a grid of places
-    the one that improves :math:`\chi^2` the most decides, one star or two.  How profiles differ
+    what the nearest bright stars have in common is taken off, and the likelihood with a companion,
+    averaged over directions and magnitudes, over that without one decides.  How profiles differ
     from star to star (by color, or because the PSF does not follow) shows in those that are
     narrower, which no companion makes.
     """
@@ -156,10 +157,23 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     pushed = weight @ changes
     # One over the error of a companion's share of the light.
     known = np.sqrt(np.maximum(np.einsum("id,sid->sd", changes, pushed), 1e-300))
-    significance = np.einsum("si,sid->sd", amplitude, pushed) / known
-    limit = _MAX_COMPANION * np.maximum(_KNOWN * known.mean(axis=1), 1) ** 0.25
-    broad[rows] = significance.max(axis=1) > limit
+    share = np.einsum("si,sid->sd", amplitude, pushed) / known**2
+    limit = _ODDS * np.maximum(_KNOWN * known.mean(axis=1), 1)
+    broad[rows] = _log_odds(share, known) > limit
     return broad, excess
+
+
+def _log_odds(share, known):
+    """Logarithm of the odds (N,) for a companion, wherever and however bright it may be.
+
+    From the shares of the light (N, K) that a companion at each place seems to have, and one over
+    their errors.
+    """
+    odds = [
+        np.logaddexp.reduce(light * known**2 * (share - 0.5 * light), axis=1)
+        for light in 10 ** (-0.4 * _FAINTER)
+    ]
+    return np.logaddexp.reduce(odds, axis=0) - np.log(share.shape[1] * len(odds))
 
 
 def _normal(field, profile, noise, stars, modes, *, radius, subtracted):

@@ -1,4 +1,4 @@
-"""The effective PSF of a frame, learnt from its own stars."""
+"""The effective PSF of a frame, learned from its own stars."""
 
 from dataclasses import replace
 
@@ -42,6 +42,11 @@ _HALF_PIXEL_KNOTS = 1.8
 
 # Places along each axis at which a varying profile is tabulated.
 _N_NODES = 5
+
+# Inverse square of the size of a group of amplitudes: of order one, which would be a different
+# star, and so small that nobody could tell; rounds at most to find it.
+_LEAST_PRECISION, _MOST_PRECISION = 10.0, 1e10
+_MAX_ROUNDS = 100
 
 # Pixels further off the model than this many sigma weigh as if they were there.
 _HUBER = 3.0
@@ -180,7 +185,7 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
     stars : Stars
         Start values.
     start : Profile
-        Profile to start from, constant or varying; what is learnt is the difference from it,
+        Profile to start from, constant or varying; what is learned is the difference from it,
         the same all over the detector.
     fwhm : float
         FWHM in px.
@@ -218,7 +223,7 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
     return profile, fits.stars.take(fits.valid), noise
 
 
-def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree, lean=False):
+def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
     r"""Let the width and the shape of a profile vary smoothly over the detector.
 
     Parameters
@@ -235,8 +240,6 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree, lean=Fal
         Radius in px of the pixels used.
     degree : int
         Degree of the polynomials in position.
-    lean : bool, optional
-        Whether its asymmetry may vary as well.
 
     Returns
     -------
@@ -255,20 +258,23 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree, lean=Fal
     with polynomials :math:`a_k(X, Y)`.  Coma, which grows off the axis of any telescope, changes
     the third derivatives.  None of these has a first moment: the meaning of the position stays the
     same all over the detector.
+
+    The amplitudes of a kind and a degree have a normal prior, as wide as the data make most likely
+    (empirical Bayes): a free cubic would take noise for coma where stars are few, in the corners.
     """
     scale = fwhm * profile.oversampling
-    modes = blur_modes(profile.coefficients[0], scale)
-    if lean:
-        modes += odd_modes(profile.coefficients[0], scale)
+    blur, odd = (f(profile.coefficients[0], scale) for f in (blur_modes, odd_modes))
+    modes = blur + odd
     left, right = reduced_normal(field, profile, noise, stars, modes, radius)
     ny, nx = field.image.shape
     terms = _polynomial_terms(stars.x / nx, stars.y / ny, degree)
     k, p = len(modes), terms.shape[1]
     normal = np.einsum("sij,sp,sq->ipjq", left, terms, terms).reshape(k * p, k * p)
     vector = np.einsum("si,sp->ip", right, terms).reshape(k * p)
-    # Amplitudes of order one would be a different star: a mild prior for empty regions.
-    normal[np.diag_indices(k * p)] += 10.0
-    amplitudes = np.linalg.solve(normal, vector).reshape(k, p)
+    # Blur and asymmetry have a size each, in the terms of each degree.
+    powers = np.add(*_powers(degree))
+    group = np.add.outer(np.repeat([0, degree + 1], [len(blur), len(odd)]), powers).ravel()
+    amplitudes = _likely_amplitudes(normal, vector, group).reshape(k, p)
     nodes = np.linspace(0, 1, _N_NODES)
     x, y = (v.ravel() for v in np.meshgrid(nodes, nodes))
     local = _polynomial_terms(x, y, degree) @ amplitudes.T
@@ -277,16 +283,39 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree, lean=Fal
     return _centered(varying, fwhm)
 
 
+def _likely_amplitudes(normal, vector, group):
+    """Amplitudes of the size, group by group, that the data make most likely: empirical Bayes."""
+    count = np.bincount(group)
+    precision = np.full(len(count), _LEAST_PRECISION)
+    for _ in range(_MAX_ROUNDS):
+        covariance = np.linalg.inv(normal + np.diag(precision[group]))
+        amplitudes = covariance @ vector
+        # As many of a group's numbers as the data tell, over their squares.
+        told = count - precision * np.bincount(group, np.diag(covariance))
+        square = np.bincount(group, amplitudes**2)
+        new = np.clip(told / np.maximum(square, 1e-30), _LEAST_PRECISION, _MOST_PRECISION)
+        done = np.abs(np.log(new / precision)).max() < 0.01
+        precision = new
+        if done:
+            break
+    return np.linalg.solve(normal + np.diag(precision[group]), vector)
+
+
 def _polynomial_terms(x, y, degree):
     """Legendre products up to a total degree, of positions in units of the detector's sides."""
     tx, ty = legvander(2 * x - 1, degree), legvander(2 * y - 1, degree)
-    return np.stack(
-        [tx[:, i] * ty[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1
-    )
+    i, j = _powers(degree)
+    return tx[:, i] * ty[:, j]
+
+
+def _powers(degree):
+    """Degrees in x and in y of the products up to a total degree."""
+    each = np.arange(degree + 1)
+    return np.nonzero(np.add.outer(each, each) <= degree)
 
 
 def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
-    """Spline coefficients that take up what a profile leaves: penalised least squares."""
+    """Spline coefficients that take up what a profile leaves: penalized least squares."""
     stride = 2 if finest >= _HALF_PIXEL_KNOTS else 1
     over, size = profile.oversampling // stride, (profile.coefficients.shape[-1] - 1) // stride + 1
     half = profile.radius - 1

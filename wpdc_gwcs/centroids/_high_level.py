@@ -32,7 +32,7 @@ _LEAST_PHOTONS = 0.1
 # Reduced chi square up to which the formal errors stand; beyond, they grow with its root.
 _TOLERATED_CHI2 = 1.5
 # Share of the wobble of the center of light with the place in the pixel that one frame cannot tell:
-# by so much it depends on the kind of profile that the PSF is learnt from.
+# by so much it depends on the kind of profile that the PSF is learned from.
 _UNKNOWN_WOBBLE = 0.3
 
 
@@ -72,7 +72,7 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
     An effective PSF :math:`\psi` (Anderson & King 2000, PASP 112, 1360) gives the share of the flux
     that a pixel at an offset from the star gets, so that :math:`I_{ij} = f \psi(i - x, j - y)`
     without any integration.  It is described by cubic B-splines with knots every quarter pixel; all
-    coefficients come from one penalised least-squares problem over all pixels of all stars, in
+    coefficients come from one penalized least-squares problem over all pixels of all stars, in
     turn with the positions and fluxes.  The penalty keeps :math:`\psi` close to a Moffat profile
     that is integrated over the pixels and fitted before, as far as noise or uneven sampling leave
     it open.  That start matters: positions off by a function of the pixel phase, together with a

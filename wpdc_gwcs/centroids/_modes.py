@@ -10,8 +10,8 @@ __all__ = ["blur_modes", "companions", "mode_profiles", "odd_modes", "reduced_no
 # Pixels further off the model than this many sigma weigh as if they were there.
 _HUBER = 3.0
 
-# Places of companions: distances in FWHM, and directions.
-_DISTANCES, _N_ANGLES = (0.6, 0.9), 12
+# Places of companions: distance in FWHM, and directions.
+_DISTANCE, _N_ANGLES = 0.6, 12
 
 
 def blur_modes(coefficients, scale):
@@ -73,7 +73,7 @@ def companions(coefficients, modes, scale):
     """
     size = len(coefficients)
     angle = 2 * np.pi * np.arange(_N_ANGLES) / _N_ANGLES
-    x, y = (np.outer(_DISTANCES, f(angle)).ravel() * scale for f in (np.cos, np.sin))
+    x, y = (_DISTANCE * scale * f(angle) for f in (np.cos, np.sin))
     shifted = [
         shift_matrix(size, -v) @ coefficients @ shift_matrix(size, -u).T
         for u, v in zip(x, y, strict=True)

@@ -23,9 +23,8 @@ _FAIR_MISMATCH = 0.03
 _FINEST = 1.4
 # Share of broad stars that is not chance.
 _BROAD_SHARE = 0.04
-# Chi square of left-out stars, relative, from which a PSF is better than one with less freedom: one
-# that varies in its blur, and one that leans as well.
-_BETTER_BLUR, _BETTER_LEAN = 0.99, 0.98
+# Chi square of left-out stars, relative, from which a varying PSF is better than a constant one.
+_BETTER = 0.99
 # Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
 _STARS_FOR_DEGREE = (30, 60, 200)
 
@@ -86,22 +85,17 @@ def learn_psf(field, stars, fwhm, gain, vary):
     # Every fifth star, by brightness, is left out to judge by.
     left_out = np.arange(n) % 5 == 2
     options["iterations"] = 2
-    trial = {"radius": wide, "degree": degree}
-    kinds = [trial | {"lean": lean} for lean in (False, True)]
-    tried = [profile] + [
-        vary_profile(field, noise, stars.take(~left_out), profile, fwhm, **kind) for kind in kinds
-    ]
+    kind = {"radius": wide, "degree": degree}
+    tried = [profile, vary_profile(field, noise, stars.take(~left_out), profile, fwhm, **kind)]
     chi2 = [
         np.median(fit_stars(field, p, noise, stars.take(left_out), radius=radius).chi2)
         for p in tried
     ]
-    log.debug("chi2 of left-out stars: constant PSF %.3f, varying blur %.3f, and lean %.3f", *chi2)
+    log.debug("chi2 of left-out stars: constant PSF %.3f, varying PSF %.3f", *chi2)
     # More freedom only where it brings something.
-    best = 1 if chi2[1] < _BETTER_BLUR * chi2[0] else 0
-    best = 2 if chi2[2] < _BETTER_LEAN * chi2[best] else best
-    if best == 0:
+    if not chi2[1] < _BETTER * chi2[0]:
         return profile
-    varying = vary_profile(field, noise, stars, profile, fwhm, **kinds[best - 1])
+    varying = vary_profile(field, noise, stars, profile, fwhm, **kind)
     varying, stars, noise = learn_profile(field, noise, stars, varying, **options)
     log.debug("own error of the varying PSF %.3f", noise.mismatch)
     return varying if len(stars.x) >= MIN_STARS else profile
