@@ -56,6 +56,27 @@ class Basis:
             Waves first, then polynomials, degree by degree along each axis; the last two are a
             constant along each axis.
         """
+        parts = self.along(focal, kind)
+        out = np.zeros((1 + max(mine.max() for mine, _ in parts), 2, focal.shape[1]))
+        for a, (mine, rows) in enumerate(parts):
+            out[mine, a] = rows
+        return out
+
+    def along(self, focal, kind="curl-free"):
+        """Displacements of unit coefficients along each axis, without those that are zero there.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+        kind : {'curl-free', 'axes'}, optional
+            As of `shapes`.
+
+        Returns
+        -------
+        list of (ndarray, ndarray)
+            For each axis the numbers of the coefficients ``(m,)`` and displacements ``(m, N)``.
+        """
         phases = [
             np.outer(
                 np.arange(self.orders[a].max() + 1),
@@ -65,45 +86,27 @@ class Basis:
         ]
         m = self.orders.shape[1]
         norm = 1.0 / np.sqrt(np.prod(self.half))
-        size = m if kind == "curl-free" else 2 * m
         bends = self._bends(focal)
         p = len(bends)
-        out = np.zeros((size + 2 * p + 2, 2, focal.shape[1]))
+        size = m if kind == "curl-free" else 2 * m
         sines = [np.sin(phase) for phase in phases]
-        if kind == "curl-free":
-            wave = self.wave * norm
-            for a in range(2):
-                along = np.cos(phases[a])[self.orders[a]]
-                along *= wave[a][:, None]
-                np.multiply(along, sines[1 - a][self.orders[1 - a]], out=out[:m, a])
-        else:
-            first = sines[0][self.orders[0]]
-            first *= norm
-            np.multiply(first, sines[1][self.orders[1]], out=out[:m, 0])
-            out[m : 2 * m, 1] = out[:m, 0]
-        out[size : size + p, 0] = out[size + p : size + 2 * p, 1] = bends
-        out[-2, 0] = out[-1, 1] = 1.0
-        return out
-
-    def moving(self, kind="curl-free"):
-        """Along which axes the shapes move stars, ``(2, K)`` of bool; what does not is zero there.
-
-        Parameters
-        ----------
-        kind : {'curl-free', 'axes'}, optional
-            As of `shapes`.
-
-        Returns
-        -------
-        ndarray
-            First axis, second axis.
-        """
-        m = self.orders.shape[1]
-        p = sum(n + 1 for n in range(BEND_DEGREES[0], BEND_DEGREES[-1] + 1)) if self.bends else 0
-        waves = [(m, [1, 1])] if kind == "curl-free" else [(m, [1, 0]), (m, [0, 1])]
-        each = [*waves, (p, [1, 0]), (p, [0, 1]), (1, [1, 0]), (1, [0, 1])]
-        counts, axes = zip(*each)
-        return np.repeat(np.array(axes, bool), counts, axis=0).T
+        parts = []
+        for a in range(2):
+            rows = np.empty((m + p + 1, focal.shape[1]))
+            if kind == "curl-free":
+                waves = np.cos(phases[a])[self.orders[a]]
+                waves *= (self.wave[a] * norm)[:, None]
+                np.multiply(waves, sines[1 - a][self.orders[1 - a]], out=rows[:m])
+            elif a == 0:
+                np.multiply(sines[0][self.orders[0]], sines[1][self.orders[1]], out=rows[:m])
+                rows[:m] *= norm
+            else:
+                rows[:m] = parts[0][1][:m]
+            rows[m:-1], rows[-1] = bends, 1.0
+            first = 0 if kind == "curl-free" else a * m
+            mine = [first + np.arange(m), size + a * p + np.arange(p), [size + 2 * p + a]]
+            parts.append((np.concatenate(mine), rows))
+        return parts
 
     def _bends(self, focal):
         if not self.bends:
@@ -112,25 +115,23 @@ class Basis:
         return legendre_products(*place, BEND_DEGREES[0], BEND_DEGREES[-1])
 
 
-def inner_products(shapes, moving):
+def inner_products(parts):
     """Products of shapes with each other, summed over stars and axes.
 
     Parameters
     ----------
-    shapes : (K, 2, N) ndarray
-        Displacements, weighted.
-    moving : (2, K) ndarray of bool
-        Along which axes they are not zero: products with zeros would be most of the work.
+    parts : list of (ndarray, ndarray)
+        As from `Basis.along`, weighted.
 
     Returns
     -------
     (K, K) ndarray
         Symmetric.
     """
-    total = np.zeros((len(shapes), len(shapes)))
-    for a, mine in enumerate(map(np.flatnonzero, moving)):
-        own = shapes[mine, a]
-        total[np.ix_(mine, mine)] += own @ own.T
+    n = 1 + max(mine.max() for mine, _ in parts)
+    total = np.zeros((n, n))
+    for mine, rows in parts:
+        total[np.ix_(mine, mine)] += rows @ rows.T
     return total
 
 

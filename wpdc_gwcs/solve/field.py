@@ -148,14 +148,14 @@ def fit_field(basis, spectrum, focal, residual, variance):
     """
     weight = 1.0 / (variance + spectrum.unresolved(basis))
     root = np.sqrt(spectrum.prior(basis))
-    shapes = basis.shapes(focal, spectrum.kind)
-    shapes *= root[:, None, None]
-    shapes *= np.sqrt(weight)
-    inner = inner_products(shapes, basis.moving(spectrum.kind))
-    shapes = shapes.reshape(len(shapes), -1)
+    parts, right = basis.along(focal, spectrum.kind), np.zeros(len(root))
+    for a, (mine, rows) in enumerate(parts):
+        rows *= root[mine, None]
+        rows *= np.sqrt(weight[a])
+        right[mine] += rows @ (np.sqrt(weight[a]) * residual[a])
+    inner = inner_products(parts)
     inner[np.diag_indices_from(inner)] += 1.0
     lower, _ = lapack.dpotrf(inner, lower=1, clean=1)
-    right = shapes @ (np.sqrt(weight) * residual).ravel()
     coefficients = root * lapack.dpotrs(lower, right, lower=1)[0]
     inverse, _ = lapack.dtrtri(lower, lower=1)
     freedom = (len(root) - np.sum(inverse**2)) / max(focal.shape[1], 1)

@@ -62,9 +62,9 @@ def frame_equations(design, residual, weight, *, field=None):
         Columns of the P unknowns at N stars.
     residual, weight : (2, N) ndarray
         Residuals and inverse variances, px.
-    field : (shapes, moving, prior), optional
-        Shapes ``(M, 2, N)``, along which axes they move stars ``(2, M)`` and prior variances
-        ``(M,)`` of the frame's field, which is marginalized: the noise covariance becomes
+    field : (parts, prior), optional
+        Shapes of the frame's field along each axis, as from `Basis.along`, and their prior
+        variances ``(M,)``.  It is marginalized: the noise covariance becomes
         diag(1 / weight) + shapes^T prior shapes.
 
     Returns
@@ -80,11 +80,14 @@ def frame_equations(design, residual, weight, *, field=None):
     rows = [np.vstack([design.shapes, residual[a]]) * root[a] for a in range(2)]
     products = sum(m.T @ (r @ r.T) @ m for m, r in zip(mix, rows))
     if field is not None:
-        shapes, moving, prior = field
-        heavy = shapes * np.sqrt(prior)[:, None, None]
-        heavy *= root
-        inner = inner_products(heavy, moving)
-        cross = sum(heavy[:, a] @ rows[a].T @ mix[a] for a in range(2))
+        parts, prior = field
+        heavy = []
+        for a, (mine, shapes) in enumerate(parts):
+            heavy.append((mine, shapes * np.sqrt(prior[mine])[:, None]))
+            heavy[a][1][:] *= root[a]
+        inner, cross = inner_products(heavy), np.zeros((len(prior), n + 1))
+        for a, (mine, shapes) in enumerate(heavy):
+            cross[mine] += shapes @ rows[a].T @ mix[a]
         inner[np.diag_indices_from(inner)] += 1.0
         factor, _ = lapack.dpotrf(inner, lower=1)
         half, _ = lapack.dtrtrs(factor, cross, lower=1)

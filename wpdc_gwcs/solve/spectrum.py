@@ -181,21 +181,25 @@ def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
         For `learn_spectra`.
     """
     matrix, right = {}, {}
-    w = weight.ravel()
-    r = residual.ravel()
+    root = np.sqrt(weight)
+    target = root * residual
+    if nuisance is not None:
+        free = (nuisance * root[:, :, None]).reshape(-1, nuisance.shape[2])
+        normal, free_target = free.T @ free, free.T @ target.ravel()
+        free = free.reshape(nuisance.shape)
     for kind in kinds:
-        shapes = basis.shapes(focal, kind)
-        shapes *= np.sqrt(weight)
-        g = inner_products(shapes, basis.moving(kind))
-        shapes = shapes.reshape(len(shapes), -1)
-        h = shapes @ (np.sqrt(w) * r)
+        parts = basis.along(focal, kind)
+        for a, (_, rows) in enumerate(parts):
+            rows *= root[a]
+        g = inner_products(parts)
+        h = np.zeros(len(g))
+        for a, (mine, rows) in enumerate(parts):
+            h[mine] += rows @ target[a]
         if nuisance is not None:
-            free = nuisance.reshape(-1, nuisance.shape[2])
-            cross = (shapes @ (free * np.sqrt(w)[:, None])).T
-            normal = (free * w[:, None]).T @ free
-            solved = np.linalg.lstsq(
-                normal, np.column_stack([cross, (free * w[:, None]).T @ r]), rcond=1e-12
-            )[0]
+            cross = np.zeros((len(normal), len(g)))
+            for a, (mine, rows) in enumerate(parts):
+                cross[:, mine] += (rows @ free[a]).T
+            solved = np.linalg.lstsq(normal, np.column_stack([cross, free_target]), rcond=1e-12)[0]
             g = g - cross.T @ solved[:, :-1]
             h = h - cross.T @ solved[:, -1]
         matrix[kind], right[kind] = g, h

@@ -130,8 +130,7 @@ def _products(o, state):
         marginal = None
         if spectrum is not None:
             basis = state.bases[k]
-            shapes = basis.shapes(focal[:, kept], spectrum.kind)
-            marginal = shapes, basis.moving(spectrum.kind), spectrum.prior(basis)
+            marginal = basis.along(focal[:, kept], spectrum.kind), spectrum.prior(basis)
         yield k, e, *frame_equations(columns, -residual[:, kept], 1.0 / variance, field=marginal)
 
 
