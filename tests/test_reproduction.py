@@ -133,6 +133,24 @@ def test_cluster(made):
     }  # fmt: skip
 
 
+def test_cluster_in_two_processes(made, tmp_path):
+    """Frames are handed to other processes with the sources that were measured before."""
+    results = reproduce(("cluster",), tmp_path, scale=SMALL, seed=1, jobs=2)
+    for quantity in ("sigma_dx", "wcs_rms", "n_stars"):
+        expected = value(made[1][made[1]["part"] == "cluster"], "g-1", quantity)
+        assert value(results, "g-1", quantity) == pytest.approx(expected, rel=1e-3)
+
+
+def test_parts_that_are_done_are_kept(tmp_path, monkeypatch):
+    def fails(*args, **kwargs):
+        raise OSError("disk")
+
+    monkeypatch.setitem(PARTS, "bass", fails)
+    with pytest.raises(OSError, match="disk"):
+        reproduce(("centroids", "bass"), tmp_path, scale=SMALL, seed=1)
+    assert set(Table.read(tmp_path / "results.ecsv")["part"]) == {"centroids"}
+
+
 def test_centroids_reach_the_photon_limit(made):
     folder, results = made
     results = results[results["part"] == "centroids"]

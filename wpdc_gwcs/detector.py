@@ -5,7 +5,7 @@ import numpy as np
 __all__ = ["on_detector"]
 
 
-def on_detector(x, y, image_shape):
+def on_detector(x, y, image_shape, *, margin=0.0):
     """Tell which positions lie on a detector, its outer edges included.
 
     Parameters
@@ -14,6 +14,8 @@ def on_detector(x, y, image_shape):
         Pixel coordinates, zero based.
     image_shape : (int, int)
         Shape ``(ny, nx)``.
+    margin : float, optional
+        Width in px of a rim that does not count.
 
     Returns
     -------
@@ -28,4 +30,5 @@ def on_detector(x, y, image_shape):
     """
     ny, nx = image_shape
     x, y = np.asarray(x, float), np.asarray(y, float)
-    return (x >= -0.5) & (x <= nx - 0.5) & (y >= -0.5) & (y <= ny - 0.5)
+    low, right, top = margin - 0.5, nx - 0.5 - margin, ny - 0.5 - margin
+    return (x >= low) & (x <= right) & (y >= low) & (y <= top)

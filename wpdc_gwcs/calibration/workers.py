@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
 from multiprocessing.reduction import ForkingPickler
+from pickle import PicklingError
 
 from astropy.table import Table
 
@@ -263,7 +264,7 @@ class Workers:
         """Done by a thread: hand the task to its process, a new one where that has died."""
         try:
             message = ForkingPickler.dumps(task.alone())
-        except (TypeError, AttributeError, ValueError) as problem:
+        except (PicklingError, TypeError, AttributeError, ValueError) as problem:
             reason = " ".join(str(problem).split())
             failure = FrameFailure(
                 f"{task.frame.source or task.frame.name}: the frame cannot be handed to another "

@@ -17,7 +17,7 @@ _CHUNK = 4000
 # light is known better than the last number, it is as many times larger: companions of a bright
 # star show far beyond, and bright stars are few.
 _FAINTER = np.linspace(0, 4, 9)
-_ODDS, _KNOWN = 1.3, 0.017
+_ODDS, _KNOWN = 1.2, 0.017
 # Stars nearest in place, and the best measured of all, that tell how profiles differ.
 _NEAREST, _BEST = 25, 300
 _LEAST = 20

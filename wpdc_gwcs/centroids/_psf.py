@@ -9,6 +9,7 @@ from wpdc_gwcs.centroids._build import OVERSAMPLING, fit_moffat, learn_profile, 
 from wpdc_gwcs.centroids._fit import fit_radius, fit_stars
 from wpdc_gwcs.centroids._noise import Noise
 from wpdc_gwcs.centroids._profile import Profile, moffat_samples
+from wpdc_gwcs.centroids._wings import with_wings
 from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["MIN_STARS", "learn_psf"]
@@ -52,20 +53,32 @@ def learn_psf(field, stars, fwhm, gain, vary):
         None if the fits fail.
     """
     half = int(np.clip(np.ceil(3 * fwhm), 6, 20)) + 1
-    radius = fit_radius(fwhm)
-    wide = radius + 0.5 * fwhm
     noise = Noise(0.0 if gain is None else 1 / gain, 0.03)
+    radius = fit_radius(fwhm)
+    options = {"fwhm": fwhm, "radius": radius, "gain": gain}
+    wide = radius + 0.5 * fwhm
     shape = fit_moffat(field, noise, stars.take(slice(200)), fwhm, half=half, radius=wide)
     start = Profile.constant(moffat_samples(shape, half, OVERSAMPLING), OVERSAMPLING)
-    options = {"fwhm": fwhm, "radius": radius, "gain": gain}
-    chosen = stars
+    profile, stars, noise, finest = _learn_constant(field, noise, stars, start, options)
+    if len(stars.x) < MIN_STARS:
+        return None
+    log.debug("effective PSF from %d stars, own error %.3f", len(stars.x), noise.mismatch)
+    if vary != "never":
+        options |= {"iterations": 2, "finest": finest}
+        profile, stars = _learn_varying(field, noise, stars, profile, options)
+    return with_wings(field, profile, stars)
+
+
+def _learn_constant(field, noise, chosen, start, options):
+    """One profile for all places, its stars, its noise and the width in px of its structure."""
+    fwhm, radius = options["fwhm"], options["radius"]
     profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=4, **options)
     broad, _ = judge_profiles(field, profile, noise, stars, stars.flux > 0, fwhm, radius)
     if broad.mean() > _BROAD_SHARE and np.count_nonzero(~broad) >= MIN_STARS:
         # Hidden companions have made the profile broader.
         chosen = stars.take(~broad)
         profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=2, **options)
-    finest = fwhm
+    finest = best = fwhm
     while noise.mismatch > _FAIR_MISMATCH and finest > 2 * _FINEST:
         # Rings and trails have edges that are finer than they are wide.
         finest = max(0.25 * finest, _FINEST)
@@ -73,19 +86,19 @@ def learn_psf(field, stars, fwhm, gain, vary):
         found = learn_profile(field, noise, chosen, profile, **finer)
         if len(found[1].x) >= max(MIN_STARS, len(stars.x) // 2):
             if found[2].mismatch < noise.mismatch:
-                options["finest"] = finest
+                best = finest
                 profile, stars, noise = found
-    n = len(stars.x)
-    if n < MIN_STARS:
-        return None
-    log.debug("effective PSF from %d stars, own error %.3f", n, noise.mismatch)
-    degree = int(np.searchsorted(_STARS_FOR_DEGREE, n))
-    if vary == "never" or degree == 0:
-        return profile
+    return profile, stars, noise, best
+
+
+def _learn_varying(field, noise, stars, profile, options):
+    """Profile that varies over the detector if that is better, and its stars."""
+    n, fwhm, radius = len(stars.x), options["fwhm"], options["radius"]
+    kind = {"radius": radius + 0.5 * fwhm, "degree": int(np.searchsorted(_STARS_FOR_DEGREE, n))}
+    if kind["degree"] == 0:
+        return profile, stars
     # Every fifth star, by brightness, is left out to judge by.
     left_out = np.arange(n) % 5 == 2
-    options["iterations"] = 2
-    kind = {"radius": wide, "degree": degree}
     tried = [profile, vary_profile(field, noise, stars.take(~left_out), profile, fwhm, **kind)]
     chi2 = [
         np.median(fit_stars(field, p, noise, stars.take(left_out), radius=radius).chi2)
@@ -94,8 +107,8 @@ def learn_psf(field, stars, fwhm, gain, vary):
     log.debug("chi2 of left-out stars: constant PSF %.3f, varying PSF %.3f", *chi2)
     # More freedom only where it brings something.
     if not chi2[1] < _BETTER * chi2[0]:
-        return profile
+        return profile, stars
     varying = vary_profile(field, noise, stars, profile, fwhm, **kind)
-    varying, stars, noise = learn_profile(field, noise, stars, varying, **options)
+    varying, kept, noise = learn_profile(field, noise, stars, varying, **options)
     log.debug("own error of the varying PSF %.3f", noise.mismatch)
-    return varying if len(stars.x) >= MIN_STARS else profile
+    return (varying, kept) if len(kept.x) >= MIN_STARS else (profile, stars)

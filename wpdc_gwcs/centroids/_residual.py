@@ -16,7 +16,7 @@ __all__ = ["Painter", "Residual", "Scene"]
 _STRIP, _CACHED = 3_000_000, 250_000
 
 # Half-widths in px that stars are drawn with, up to that of the profile: faint ones are smaller.
-_SIZES = (3, 5, 8, 12)
+_SIZES = (3, 5, 8, 12, 20)
 # Light in the wings that may be left out, in standard deviations of the sky.
 _FAINTEST = 0.1
 

@@ -11,7 +11,8 @@ from wpdc_gwcs.centroids._fit import StarFits, Stars, fit_radius, fit_stars, sta
 from wpdc_gwcs.centroids._joint import joint_step
 from wpdc_gwcs.centroids._modes import blur_modes, mode_profiles, odd_modes
 from wpdc_gwcs.centroids._noise import Noise, bin_noise, bin_odd_noise, estimate_noise
-from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EXTENDED, FLAG_SATURATED
+from wpdc_gwcs.detector import on_detector
+from wpdc_gwcs.flags import FLAG_BLENDED, FLAG_EDGE, FLAG_EXTENDED, FLAG_SATURATED
 from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["MAX_CHI2", "fit_all", "judge_neighbors", "near", "noise_bins"]
@@ -32,6 +33,9 @@ _LEAST_ERROR, _SATURATED_ERROR, _NO_MODEL = 0.02, 0.2, 1.0
 _FIRST_STEPS = 2
 # Signal-to-noise ratio of stars from which companions under them show.
 _LEAST_SNR = 15.0
+# Distance from the edge of the image, in FWHM, from which the fit of a star is as good as its error
+# says, though its core reaches over the edge.
+_INSIDE = 0.3
 # A star is blended where its neighbors cost it more than this many times the error it would have
 # alone, and more than so many px.
 _MAX_COST, _TOLERATED_COST = 1.5, 0.01
@@ -170,7 +174,7 @@ def _fit_again(scene, profile, noise, start, rows, radius):
 
 @one_blas_thread
 def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
-    """Find what neighbors cost the fits, and who is broader than a star.
+    """Find what neighbors and edges cost the fits, and which sources are broader than a star.
 
     Parameters
     ----------
@@ -222,6 +226,8 @@ def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
     error = np.hypot(after, shift)
     blended = ~(error < np.maximum(_MAX_COST * before, _TOLERATED_COST)) & fitted
     flags = np.where(fitted, flags & ~FLAG_BLENDED, flags)
+    inside = fitted & on_detector(own.x, own.y, field.image.shape, margin=_INSIDE * fwhm)
+    flags = np.where(inside, flags & ~FLAG_EDGE, flags)
     flags |= np.where(blended, FLAG_BLENDED, 0) | np.where(broad, FLAG_EXTENDED, 0)
     joint = np.where(np.isfinite(joint), joint, alone)
     return replace(fits, covariance=joint, chi2=fits.chi2 - excess), shift, flags

@@ -87,6 +87,7 @@ def reproduce(parts, folder, *, scale=FULL, seed=SEED, jobs=1, overwrite=False, 
         except OSError as problem:
             raise InputError(f"{folder / part}: cannot be made: {problem.strerror}") from problem
         tables.append(PARTS[part](folder / part, scale, seed=seed, jobs=jobs, progress=progress))
-    results = vstack(tables)
-    write_table(results, target, overwrite=overwrite)
+        # After every part: they take minutes each.
+        results = vstack(tables)
+        write_table(results, target, overwrite=overwrite or len(tables) > 1)
     return results

@@ -81,10 +81,7 @@ def reproduce_cluster(folder, scale, *, seed=SEED, jobs=1, progress=None):
         jobs=jobs,
     )
     frames = {exposure.name: exposure.frame() for exposure in simulation.exposures}
-    listed = [
-        replace(frames[c.frame], load_sources=lambda sources=c.sources: sources)
-        for c in measured.calibrations
-    ]
+    listed = [replace(frames[c.frame], load_sources=c.sources.copy) for c in measured.calibrations]
     cuts = Cuts(min_radius=500 * shrink, max_radius=4000 * shrink, min_snr=_MIN_SNR)
     numbers = {}
     for done, (name, method) in enumerate(METHODS.items()):

@@ -51,7 +51,7 @@ class Scale:
 
     detectors: tuple[str, ...] = DETECTORS
     n_fields: int = 25
-    densities: tuple[float, float] = (24.0, 500.0)
+    densities: tuple[float, float] = (36.0, 500.0)
     camera: dict = field(default_factory=dict)
     r0: float = 4000.0
     slice_width: float = 512.0
