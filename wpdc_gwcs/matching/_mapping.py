@@ -278,7 +278,7 @@ def fit_smooth_map(
     u, v = (x - center[0]) / scale, (y - center[1]) / scale
     target = np.column_stack([x_ref - x, y_ref - y])
     used = np.ones(len(x), bool)
-    fit = whole = None
+    fit, whole = None, np.empty((0, 0))
     for _ in range(8):
         count = np.count_nonzero(used)
         few = count < PAIRS_PER_TERM * count_terms(_NARROW_ORDER + 1)
@@ -289,8 +289,8 @@ def fit_smooth_map(
             top += 1
         if top == 0:
             return fit
-        if whole is None:
-            # Of the highest order there will be: fewer pairs carry no higher one.
+        # Fewer pairs seldom carry a higher order: those of a narrow frame may.
+        if whole.shape[1] < count_terms(top):
             whole = _design(u, v, top)
         design = whole[:, columns[: size[top]]]
         q, r = np.linalg.qr(design[used])
