@@ -6,8 +6,6 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from wpdc_gwcs import kernels
@@ -349,38 +347,3 @@ def test_unknown_kernels_are_one_line():
     assert done.stderr == (
         "wpdc: error: WPDC_GWCS_KERNELS must be 'compiled' or 'numpy', not 'fortran'\n"
     )
-
-
-# ---- text ----------------------------------------------------------------------------------------
-
-
-def test_texts_are_those_of_python(compiled, rng):
-    """Of every size, of few and of all digits, and at the ends of what is written the quick way."""
-    tens = 10.0 ** np.arange(-25, 25)
-    numbers = np.concatenate(
-        [
-            rng.uniform(-9216, 9216, 20_000),
-            10.0 ** rng.uniform(-320, 308, 5000),
-            10.0 ** rng.uniform(-7, 17, 20_000),
-            rng.integers(1, 10**7, 20_000) / 10.0 ** rng.integers(0, 14, 20_000),
-            rng.uniform(0, 1, 5000).astype(np.float32),
-            2.0 ** np.arange(-80, 80),
-            [*tens, *np.nextafter(tens, 0), *np.nextafter(tens, np.inf), 4503599627370495.5],
-            [0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 1e-4, 9.9e-5, 1e16, 9007199254740993.0],
-        ]
-    )
-    assert compiled.shortest_texts(numbers) == [repr(number) for number in numbers.tolist()]
-    assert in_numpy.shortest_texts(numbers) == compiled.shortest_texts(numbers)
-
-
-@given(st.lists(st.floats()))
-def test_texts_read_back(numbers):
-    texts = kernels.shortest_texts(np.array(numbers, dtype=float))
-    assert_array_equal([float(text) for text in texts], numbers)
-
-
-def test_texts_of_other_arrays(compiled):
-    for values in (np.zeros(3, int), np.zeros((4, 4))[:, ::2], None):
-        with pytest.raises((TypeError, ValueError, BufferError)):
-            compiled.shortest_texts(values)
-    assert compiled.shortest_texts(np.zeros(0)) == []

@@ -11,7 +11,6 @@ from astropy.table import Table
 from wpdc_gwcs.catalogs import read_table_file
 from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.files import READ_ERRORS, as_utf8, atomic_path, file_kind, first_line
-from wpdc_gwcs.kernels import shortest_texts
 
 __all__ = ["read_matches", "read_table", "write_table"]
 
@@ -129,18 +128,15 @@ def _text_of(table):
 
 def _rows_of(table):
     columns = [_cells(column) for column in table.itercols()]
-    text = "\n".join(map(" ".join, zip(*columns, strict=True)))
-    return text + "\n" if len(table) else ""
+    return "".join(" ".join(row) + "\n" for row in zip(*columns, strict=True))
 
 
 def _cells(column):
     values = np.asarray(column)
     if values.dtype.kind == "f" and values.dtype.itemsize == 8:
-        return shortest_texts(np.ascontiguousarray(values, dtype=float))
-    if values.dtype.kind in "biu":
-        return map(str, values.tolist())
-    if values.dtype.kind == "f":
-        # Fewer digits bring numbers of fewer bits back, which NumPy knows.
+        # The shortest text that reads back to the same number.
+        return map(repr, values.tolist())
+    if values.dtype.kind in "biuf":
         return values.astype(str).tolist()
     return [_quoted(str(value)) for value in values.tolist()]
 

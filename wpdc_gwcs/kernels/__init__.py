@@ -3,7 +3,7 @@
 `implementation` says which of the two is at work, ``"compiled"`` or ``"numpy"``; this module is the
 only one that knows.  The environment variable ``WPDC_GWCS_KERNELS=numpy`` asks for NumPy.  Both do
 the same; those of the WCS do the same operations in the same order, so that their results have the
-same bits, those of stars agree to rounding, and the texts of numbers are the same.
+same bits, those of stars agree to rounding.
 """
 
 import os
@@ -26,7 +26,6 @@ __all__ = [
     "jacobian",
     "paint_stars",
     "rows_to_sky",
-    "shortest_texts",
     "star_profiles",
     "star_steps",
     "tangent_numbers",
@@ -59,7 +58,6 @@ invert = _kernels.invert
 jacobian = _kernels.jacobian
 paint_stars = _kernels.paint_stars
 rows_to_sky = _kernels.rows_to_sky
-shortest_texts = _kernels.shortest_texts
 star_profiles = _kernels.star_profiles
 star_steps = _kernels.star_steps
 to_sky = _kernels.to_sky

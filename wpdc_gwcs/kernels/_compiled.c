@@ -10,7 +10,6 @@
 #include <Python.h>
 #include <stdlib.h>
 
-#include "digits.h"
 #include "inverse.h"
 #include "sky.h"
 #include "stars.h"
@@ -485,44 +484,12 @@ static PyObject *star_steps(PyObject *self, PyObject *const *args, Py_ssize_t n_
     return finish(&held, good);
 }
 
-/* The text of a number where the quick way does not serve. */
-static PyObject *text_of(double value) {
-    char *text = PyOS_double_to_string(value, 'r', 0, Py_DTSF_ADD_DOT_0, NULL);
-    PyObject *result = text ? PyUnicode_FromString(text) : NULL;
-    PyMem_Free(text);
-    return result;
-}
-
-static PyObject *shortest_texts(PyObject *self, PyObject *const *args, Py_ssize_t n_args) {
-    Buffers held = {.n = 0};
-    ptrdiff_t size;
-    const double *values;
-    PyObject *texts = NULL;
-    (void)self;
-    if (count(n_args, 1) == 0 && (values = numbers(&held, args[0], 0, &size)) &&
-        (texts = PyList_New(size))) {
-        for (ptrdiff_t k = 0; k < size; k++) {
-            char text[MOST_TEXT];
-            const int n = shortest(values[k], text);
-            PyObject *one = n ? PyUnicode_FromStringAndSize(text, n) : text_of(values[k]);
-            if (!one) {
-                Py_DECREF(texts);
-                texts = NULL;
-                break;
-            }
-            PyList_SetItem(texts, k, one);
-        }
-    }
-    release(&held);
-    return texts;
-}
-
 #define METHOD(name) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, NULL}
 
 static PyMethodDef methods[] = {
     METHOD(evaluate), METHOD(jacobian), METHOD(to_sky), METHOD(rows_to_sky),
     METHOD(from_sky), METHOD(invert),   METHOD(star_profiles), METHOD(paint_stars),
-    METHOD(star_steps), METHOD(shortest_texts), {NULL, NULL, 0, NULL},
+    METHOD(star_steps), {NULL, NULL, 0, NULL},
 };
 
 /* Cells in memory, all of a cell side by side: four cache lines. */

@@ -19,7 +19,6 @@ __all__ = [
     "jacobian",
     "paint_stars",
     "rows_to_sky",
-    "shortest_texts",
     "star_profiles",
     "star_steps",
     "to_sky",
@@ -648,22 +647,3 @@ def _solve(plane, limits, a, b, x, y, index, x_out, y_out, *, bounded):
         going &= np.isfinite(x_new) & np.isfinite(y_new)
         going &= ~done
         a, b, x, y, index = (values[going] for values in (a, b, x_new, y_new, index))
-
-
-# ---- text ----------------------------------------------------------------------------------------
-
-
-def shortest_texts(values):
-    """Write each number as the shortest text that reads back to the same number.
-
-    Parameters
-    ----------
-    values : (N,) ndarray
-        Numbers, contiguous float64.
-
-    Returns
-    -------
-    texts : list of str
-        As `repr` writes Python's floats.
-    """
-    return list(map(repr, values.tolist()))
