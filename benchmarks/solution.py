@@ -1,6 +1,7 @@
 """Accuracy, errors, time and memory of the joint solution, from pairs to instrument and attitudes.
 
     python benchmarks/solution.py [--cases smooth-dense ...] [--seeds 1 2] [--scamp single]
+    python benchmarks/solution.py --cases smooth-dense --whole
 
 Fields come from the laboratory that stands beside the project (``truth.py``, ``field.py``,
 ``judge.py``), found through the environment variable WPDC_GWCS_LAB or as ../shared/lab.  The true
@@ -9,13 +10,17 @@ over the whole detector.  Pulls are residuals over predicted errors: of stars he
 second solution), of the stars in the fit, and of the map itself, its error on the grid over
 ``calibration.uncertainty``.  Seconds are those of the processor, since other work delays the clock;
 "table s" is the time of choosing and building the table, within "s".  SCAMP, where it is installed,
-gets the files of the same case (degrees 3 and 5, rms in px).
+gets the files of the same case (degrees 3 and 5, rms in px).  With --whole nothing of that is done:
+``wpdc calibrate`` runs from the catalogs to the WCS files, as often as --runs says, and its CPU and
+wall seconds and peak memory are those of the system for the process and its children.
 """
 
 import argparse
+import json
 import os
 import resource
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -182,6 +187,45 @@ def scamp_beside(case, seed):
         return [judge.scamp_beside(ref, observed, catalogs, folder, d)["rms"] for d in (3, 5)]
 
 
+def whole(case, seed, n_exposures, n_jobs):
+    """CPU and wall seconds and peak memory in GB of the command, from catalogs to WCS files."""
+    import judge
+
+    if n_exposures is not None:
+        judge.CASES[case]["n"] = n_exposures
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder).resolve()
+        _, observed, catalogs = judge.build(case, seed, folder)
+        command = [sys.executable, "-m", "wpdc_gwcs", "calibrate", *catalogs, "--quiet"]
+        command += ["--catalog", folder / "ref.fits", "--output", folder / "out", "--jobs", n_jobs]
+        # From a small process: the peak of a child begins with that of its parent.
+        code = "import json, os, subprocess, sys, time; began = time.perf_counter(); "
+        code += "p = subprocess.Popen(sys.argv[1:]); _, status, u = os.wait4(p.pid, 0); "
+        code += "wall = time.perf_counter() - began; "
+        code += "print(json.dumps([status, u.ru_utime + u.ru_stime, wall, u.ru_maxrss / 2**20]))"
+        timer = [sys.executable, "-S", "-E", "-c", code, *map(str, command)]
+        answer = subprocess.run(timer, check=True, capture_output=True, text=True).stdout
+        status, *figures = json.loads(answer)
+        if status or len(list((folder / "out").glob("*.wcs.asdf"))) != len(catalogs):
+            sys.exit(f"{case}: not all exposures were solved")
+        return figures, [len(sources) for _, _, sources in observed]
+
+
+def print_whole(options):
+    print(f"{'case':14s} {'seed':>4s} {'files':>5s} {'sources':>7s} {'CPU s':>6s} {'wall s':>6s} "
+          f"{'GB':>5s}")  # fmt: skip
+    for seed in options.seeds:
+        for case in options.cases:
+            runs = [whole(case, seed, options.exposures, options.jobs) for _ in range(options.runs)]
+            cpu, wall, peak = np.median([figures for figures, _ in runs], axis=0)
+            sources = runs[0][1]
+            print(
+                f"{case:14s} {seed:4d} {len(sources):5d} {np.median(sources):7.0f} {cpu:6.1f} "
+                f"{wall:6.1f} {peak:5.2f}",
+                flush=True,
+            )
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", nargs="+", choices=LIMITS, default=list(LIMITS))
@@ -194,8 +238,15 @@ def main():
     parser.add_argument(
         "--scamp", choices=("none", "single", "all"), default="single", help="run SCAMP beside"
     )
+    parser.add_argument(
+        "--whole", action="store_true", help="time the command from catalogs to WCS files instead"
+    )
+    parser.add_argument("--runs", type=int, default=1, help="of --whole, medians are printed")
+    parser.add_argument("--jobs", type=int, default=1, help="of --whole")
     options = parser.parse_args()
     find_lab()
+    if options.whole:
+        return print_whole(options)
     scamp = options.scamp if shutil.which("scamp") else "none"
     if scamp != options.scamp:
         print("scamp is not installed: left out")

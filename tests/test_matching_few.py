@@ -144,3 +144,16 @@ def test_narrow_frame_fits_a_cubic_to_fifteen_pairs(rng):
     assert fit.n_terms == 7
     assert fit.scatter < 1e-3
     assert fit_smooth_map(x, y, x, y + 40 * v**3, **options).mapping.order < 3
+
+
+def test_a_narrow_frame_takes_a_higher_order_once_wrong_pairs_are_out(rng):
+    """With them there are pairs enough for all terms of degree 4, without for fewer of degree 5."""
+    x, y = rng.uniform(0, 2000, 33), rng.uniform(0, 60, 33)
+    u = (x - 999.5) / 1000
+    wrong = np.arange(33) < 4
+    x_ref, y_ref = x + 30 * u**5 + 30 * wrong, y + 10 * u**4
+    x_ref, y_ref = (v + rng.normal(0, 0.01, 33) for v in (x_ref, y_ref))
+    fit = fit_smooth_map(x, y, x_ref, y_ref, center=(999.5, 29.5), scale=1000.0, narrow=1)
+    assert fit.mapping.order >= 5
+    assert not fit.used[wrong].any()
+    assert fit.mapping(x, y)[0][fit.used] == pytest.approx(x_ref[fit.used], abs=0.1)

@@ -5,8 +5,8 @@ import pytest
 from scipy.special import erf
 
 from wpdc_gwcs.centroids import build_epsf, fit_centroids
-from wpdc_gwcs.centroids._build import _likely_amplitudes
 from wpdc_gwcs.centroids._profile import Profile
+from wpdc_gwcs.centroids._variation import _likely_amplitudes
 from wpdc_gwcs.detection import detect_sources, subtract_background
 
 SHAPE, SKY, GAIN, SIGMA = (840, 840), 40.0, 2.0, 1.0

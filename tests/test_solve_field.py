@@ -136,15 +136,19 @@ class TestEvidence:
         found = products(basis, focal, residual, 1 / variance).log_evidence(spectrum)
         assert_allclose(found, expected, rtol=1e-8)
 
-    def test_with_free_terms(self, rng):
-        """They are in both hypotheses, with a prior as wide as one likes."""
-        basis, spectrum = patch(LOW, HIGH, 15), Spectrum(0.05, 900.0)
+    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize("turned", [False, True])
+    def test_with_free_terms(self, rng, kind, turned):
+        """They are in both hypotheses, with a prior as wide as one likes, also along both axes."""
+        basis, spectrum = patch(LOW, HIGH, 15), Spectrum(0.05, 900.0, kind=kind)
         focal = places(rng, 25)
         variance = rng.uniform(0.02, 0.05, (2, 25)) ** 2
         residual = rng.normal(0, 0.05, (2, 25))
         free = np.zeros((2, 25, 4))
         free[0, :, 0] = free[1, :, 1] = 1.0
         free[0, :, 2], free[1, :, 3] = focal / 1000
+        if turned:
+            free[1, :, 2] = -focal[1] / 1000
         flat = free.reshape(50, 4)
         noise = np.diag(variance.ravel()) + 1e4 * flat @ flat.T
         expected = multivariate_normal(cov=noise + dense(basis, spectrum, focal)).logpdf(

@@ -2,14 +2,22 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
+from wpdc_gwcs.solve.basis import Basis, inner_products
 from wpdc_gwcs.solve.normal import accumulate, frame_equations, invert, posterior
+from wpdc_gwcs.solve.terms import Design
 
 # Unknowns of the camera, of a detector, of an exposure; more detectors than exposures and the
 # other way round, so that either is eliminated.
 SIZES = 2, 4, 3
 MOSAIC, MANY = (5, 2), (2, 7)
+
+
+def random_field(rng, n):
+    """Six shapes, of which one moves along each axis alone."""
+    along = np.array([0, 1, 2, 4, 5]), np.array([0, 1, 2, 3, 5])
+    return [(mine, rng.normal(size=(5, n))) for mine in along], rng.uniform(0.1, 2.0, 6)
 
 
 class System:
@@ -22,12 +30,10 @@ class System:
             for e in range(counts[1]):
                 n = 12
                 self.frames[d, e] = {
-                    "design": rng.normal(size=(2, n, sum(SIZES))),
+                    "design": Design(rng.normal(size=(5, n)), rng.normal(size=(2, 5, sum(SIZES)))),
                     "residual": rng.normal(size=(2, n)),
                     "weight": rng.uniform(0.5, 3.0, (2, n)),
-                    "field": (rng.normal(size=(6, 2, n)), rng.uniform(0.1, 2.0, 6))
-                    if field
-                    else None,
+                    "field": random_field(rng, n) if field else None,
                 }
         a = rng.normal(size=(counts[1], SIZES[2], SIZES[2]))
         self.priors = (
@@ -61,10 +67,13 @@ class System:
         right = np.concatenate([pull.ravel() for pull in self.pulls])
         for (d, e), f in self.frames.items():
             rows = np.zeros((f["residual"].size, size))
-            rows[:, self.columns(d, e)] = f["design"].reshape(len(rows), -1)
+            rows[:, self.columns(d, e)] = f["design"].rows.reshape(len(rows), -1)
             noise = np.diag(1 / f["weight"].ravel())
             if f["field"] is not None:
-                basis = f["field"][0].reshape(6, -1).T
+                shapes = np.zeros((6, 2, f["residual"].shape[1]))
+                for a, (mine, values) in enumerate(f["field"][0]):
+                    shapes[mine, a] = values
+                basis = shapes.reshape(6, -1).T
                 noise = noise + basis @ np.diag(f["field"][1]) @ basis.T
             inverse = np.linalg.inv(noise)
             matrix += rows.T @ inverse @ rows
@@ -108,7 +117,8 @@ def test_blocks_add(rng):
     halves = []
     for key, f in system.frames.items():
         for part in (slice(0, 5), slice(5, None)):
-            cut = {k: f[k][:, part] for k in ("design", "residual", "weight")}
+            cut = {k: f[k][:, part] for k in ("residual", "weight")}
+            cut["design"] = Design(f["design"].shapes[:, part], f["design"].mix)
             halves.append((key, cut))
     assert_allclose(flat(system.solve(halves)), flat(system.solve()), atol=1e-11)
 
@@ -121,12 +131,13 @@ def test_order_of_the_frames_does_not_matter(rng):
 
 def test_nothing_shared(rng):
     """A stored instrument leaves only the exposures."""
-    design, residual = rng.normal(size=(2, 8, 3)), rng.normal(size=(2, 8))
+    design = Design(rng.normal(size=(4, 8)), rng.normal(size=(2, 4, 3)))
+    residual = rng.normal(size=(2, 8))
     one = frame_equations(design, residual, np.ones((2, 8)))
     blocks = accumulate([(0, 0, *one)], (0, 0, 3), (1, 1))
     nothing = np.zeros(0), np.zeros((1, 0))
     found = posterior(blocks, *nothing, np.zeros((1, 3, 3)), (*nothing, np.zeros((1, 3))))
-    expected = np.linalg.lstsq(design.reshape(16, 3), residual.ravel(), rcond=None)[0]
+    expected = np.linalg.lstsq(design.rows.reshape(16, 3), residual.ravel(), rcond=None)[0]
     assert_allclose(found.exposures[0], expected, atol=1e-12)
     assert found.joint(0, 0).shape == (3, 3)
 
@@ -153,3 +164,20 @@ class TestInvert:
         assert np.isfinite(found).all()
         assert_allclose(np.ones(2) @ found @ np.ones(2) / 4, 0.25, rtol=1e-6)
         assert found[0, 0] > 1e10
+
+
+@pytest.mark.parametrize("kind", ["curl-free", "axes"])
+@pytest.mark.parametrize("bends", [False, True])
+def test_products_of_waves_leave_nothing_out(rng, kind, bends):
+    """Those along each axis alone, added up, are the products of all."""
+    orders = np.array([[1, 2, 1, 3], [1, 1, 2, 2]])
+    basis = Basis(np.array([50.0, 40.0]), np.array([60.0, 50.0]), orders, bends)
+    places = rng.uniform(0, 80, (2, 30))
+    shapes = basis.shapes(places, kind)
+    flat = shapes.reshape(len(shapes), -1)
+    assert_allclose(
+        inner_products(basis.along(places, kind)), flat @ flat.T, rtol=1e-12, atol=1e-12
+    )
+    for a, (mine, values) in enumerate(basis.along(places, kind)):
+        assert_array_equal(shapes[mine, a], values)
+        assert not np.delete(shapes[:, a], mine, axis=0).any()

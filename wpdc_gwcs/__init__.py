@@ -61,12 +61,13 @@ def __getattr__(name):
     if name == "__version__":
         from importlib.metadata import version
 
-        return version("wpdc_gwcs")
-    if name in _PUBLIC:
+        value = version("wpdc_gwcs")
+    elif name in _PUBLIC:
         value = getattr(import_module(f"wpdc_gwcs.{_PUBLIC[name]}"), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
 
 
 def __dir__():

@@ -9,6 +9,7 @@ from wpdc_gwcs.columns import read_numbers
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.flags import FLAG_NAMES
+from wpdc_gwcs.threads import count_threads
 
 __all__ = ["MAX_ROUNDNESS", "MIN_SNR", "judge_sources", "left_out", "select_sources"]
 
@@ -168,7 +169,9 @@ def _roundness_difference(x, y, roundness, snr, clean):
         # Sources that another rule excludes need not be judged.
         placed = np.flatnonzero(clean & np.isfinite(x) & np.isfinite(y))
         tree = KDTree(np.column_stack([x[rows], y[rows]]))
-        _, near = tree.query(np.column_stack([x[placed], y[placed]]), k=_NEIGHBORS)
+        _, near = tree.query(
+            np.column_stack([x[placed], y[placed]]), k=_NEIGHBORS, workers=count_threads()
+        )
         typical[placed] = np.median(roundness[rows][near], axis=1)
     difference = roundness - typical
     return difference, _crowded_half(difference[rows])[1]

@@ -1,10 +1,53 @@
-"""Restriction of the linear algebra library to one thread."""
+"""Threads for work without the interpreter lock, and one thread for linear algebra."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
 
 from threadpoolctl import threadpool_limits
 
-__all__ = ["one_blas_thread"]
+__all__ = ["count_threads", "map_threads", "one_blas_thread"]
+
+_MAX_THREADS = 4
 
 #: Decorator: while the function runs, linear algebra uses one thread.  The matrices are small and
 #: many: threads gain little on an idle machine, and on a busy one they wait for each other several
 #: (up to a thousand) times as long as the work takes.
 one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+
+
+def count_threads():
+    """Count the threads that work goes to: one for each processor at hand, up to four.
+
+    Returns
+    -------
+    int
+        Number of threads.
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return min(_MAX_THREADS, len(os.sched_getaffinity(0)))
+    return min(_MAX_THREADS, os.cpu_count() or 1)
+
+
+def map_threads(function, items):
+    """Call a function for each item, several at a time.
+
+    Parameters
+    ----------
+    function : callable
+        Of one item; worth it where nearly all of its time goes to linear algebra and large arrays.
+    items : iterable
+        Independent of each other.
+
+    Returns
+    -------
+    list
+        Results in the order of the items; they do not depend on the number of threads.
+    """
+    items = list(items)
+    n_threads = min(count_threads(), len(items))
+    if n_threads < 2:
+        return [function(item) for item in items]
+    # A pool of its own for each call: nothing outlives the call, so forked children and nested
+    # calls are safe.
+    with ThreadPoolExecutor(n_threads) as pool:
+        return list(pool.map(function, items))

@@ -5,11 +5,12 @@ import time
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
-from importlib.metadata import version
 
+import astropy
 import numpy as np
 from astropy.table import Table
 
+import wpdc_gwcs
 from wpdc_gwcs.calibration.checks import check_solution, shortcomings
 from wpdc_gwcs.calibration.free_stars import solve_free_stars
 from wpdc_gwcs.calibration.literal import solve_frames_literally
@@ -527,9 +528,9 @@ def _provenance(group, before=None):
     return {
         **before,
         "software": {
-            "wpdc_gwcs": version("wpdc_gwcs"),
-            "numpy": version("numpy"),
-            "astropy": version("astropy"),
+            "wpdc_gwcs": wpdc_gwcs.__version__,
+            "numpy": np.__version__,
+            "astropy": astropy.__version__,
         },
         "inputs": [*before.get("inputs", []), *(frame.source for frame in group)],
         "epochs": [min(epochs), max(epochs)] if epochs else None,

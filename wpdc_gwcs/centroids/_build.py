@@ -3,12 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 from scipy.linalg import LinAlgError, solveh_banded
 from scipy.spatial import KDTree
 
 from wpdc_gwcs.centroids._fit import fit_stars, star_like
-from wpdc_gwcs.centroids._modes import blur_modes, odd_modes, reduced_normal
+from wpdc_gwcs.centroids._modes import reduced_normal
 from wpdc_gwcs.centroids._noise import bin_noise, estimate_noise
 from wpdc_gwcs.centroids._profile import (
     Profile,
@@ -20,11 +19,11 @@ from wpdc_gwcs.centroids._profile import (
 
 __all__ = [
     "OVERSAMPLING",
+    "center_profile",
     "fit_moffat",
     "isolated",
     "learn_profile",
     "select_stars",
-    "vary_profile",
 ]
 
 OVERSAMPLING = 4
@@ -39,14 +38,6 @@ _DEVIATION = 0.3
 # FWHM in px of the finest structure from which knots every half pixel follow it as well as those
 # every quarter: to a thousandth for a Gaussian.  Wide profiles are quicker with them.
 _HALF_PIXEL_KNOTS = 1.8
-
-# Places along each axis at which a varying profile is tabulated.
-_N_NODES = 5
-
-# Inverse square of the size of a group of amplitudes: of order one, which would be a different
-# star, and so small that nobody could tell; rounds at most to find it.
-_LEAST_PRECISION, _MOST_PRECISION = 10.0, 1e10
-_MAX_ROUNDS = 100
 
 # Pixels further off the model than this many sigma weigh as if they were there.
 _HUBER = 3.0
@@ -218,100 +209,9 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
         # A profile is never known better, and the brightest stars must not rule alone.
         noise = replace(noise, mismatch=float(np.clip(noise.mismatch, 0.003, 0.3)))
         change = _residual_coefficients(field, noise, start, stars, fwhm, finest or fwhm)
-        profile = _centered(replace(start, coefficients=start.coefficients + change), fwhm)
+        profile = center_profile(replace(start, coefficients=start.coefficients + change), fwhm)
     fits = fit_stars(field, profile, noise, stars, radius=radius)
     return profile, fits.stars.take(fits.valid), noise
-
-
-def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
-    r"""Let the width and the shape of a profile vary smoothly over the detector.
-
-    Parameters
-    ----------
-    field, noise
-        As for `fit_stars`.
-    stars : Stars
-        Stars fitted with the constant profile.
-    profile : Profile
-        Constant profile.
-    fwhm : float
-        FWHM in px.
-    radius : float
-        Radius in px of the pixels used.
-    degree : int
-        Degree of the polynomials in position.
-
-    Returns
-    -------
-    Profile
-        Profile with places all over the detector.
-
-    Notes
-    -----
-    A little more or less blur changes a profile by its second derivatives, and by its fourth in
-    the next order:
-
-    .. math::
-        \psi(u, v; X, Y) = \psi + a_1 \psi_{uu} + a_2 \psi_{uv} + a_3 \psi_{vv}
-                            + a_4 \nabla^4 \psi
-
-    with polynomials :math:`a_k(X, Y)`.  Coma, which grows off the axis of any telescope, changes
-    the third derivatives.  None of these has a first moment: the meaning of the position stays the
-    same all over the detector.
-
-    The amplitudes of a kind and a degree have a normal prior, as wide as the data make most likely
-    (empirical Bayes): a free cubic would take noise for coma where stars are few, in the corners.
-    """
-    scale = fwhm * profile.oversampling
-    blur, odd = (f(profile.coefficients[0], scale) for f in (blur_modes, odd_modes))
-    modes = blur + odd
-    left, right = reduced_normal(field, profile, noise, stars, modes, radius)
-    ny, nx = field.image.shape
-    terms = _polynomial_terms(stars.x / nx, stars.y / ny, degree)
-    k, p = len(modes), terms.shape[1]
-    normal = np.einsum("sij,sp,sq->ipjq", left, terms, terms).reshape(k * p, k * p)
-    vector = np.einsum("si,sp->ip", right, terms).reshape(k * p)
-    # Blur and asymmetry have a size each, in the terms of each degree.
-    powers = np.add(*_powers(degree))
-    group = np.add.outer(np.repeat([0, degree + 1], [len(blur), len(odd)]), powers).ravel()
-    amplitudes = _likely_amplitudes(normal, vector, group).reshape(k, p)
-    nodes = np.linspace(0, 1, _N_NODES)
-    x, y = (v.ravel() for v in np.meshgrid(nodes, nodes))
-    local = _polynomial_terms(x, y, degree) @ amplitudes.T
-    grids = profile.coefficients + np.einsum("gk,kji->gji", local, np.stack(modes))
-    varying = Profile(grids, profile.oversampling, nodes * (nx - 1), nodes * (ny - 1))
-    return _centered(varying, fwhm)
-
-
-def _likely_amplitudes(normal, vector, group):
-    """Amplitudes of the size, group by group, that the data make most likely: empirical Bayes."""
-    count = np.bincount(group)
-    precision = np.full(len(count), _LEAST_PRECISION)
-    for _ in range(_MAX_ROUNDS):
-        covariance = np.linalg.inv(normal + np.diag(precision[group]))
-        amplitudes = covariance @ vector
-        # As many of a group's numbers as the data tell, over their squares.
-        told = count - precision * np.bincount(group, np.diag(covariance))
-        square = np.bincount(group, amplitudes**2)
-        new = np.clip(told / np.maximum(square, 1e-30), _LEAST_PRECISION, _MOST_PRECISION)
-        done = np.abs(np.log(new / precision)).max() < 0.01
-        precision = new
-        if done:
-            break
-    return np.linalg.solve(normal + np.diag(precision[group]), vector)
-
-
-def _polynomial_terms(x, y, degree):
-    """Legendre products up to a total degree, of positions in units of the detector's sides."""
-    tx, ty = legvander(2 * x - 1, degree), legvander(2 * y - 1, degree)
-    i, j = _powers(degree)
-    return tx[:, i] * ty[:, j]
-
-
-def _powers(degree):
-    """Degrees in x and in y of the products up to a total degree."""
-    each = np.arange(degree + 1)
-    return np.nonzero(np.add.outer(each, each) <= degree)
 
 
 def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
@@ -408,8 +308,21 @@ def _add_prior(band, samples, fwhm, finest, over, area):
                 band[stride * (i - j), first + stride * j] += difference[i] * difference[j] * weight
 
 
-def _centered(profile, fwhm):
-    """Profile with unit sums and windowed centroids at the origin."""
+def center_profile(profile, fwhm):
+    """Make sums of one and windowed centroids at the origin.
+
+    Parameters
+    ----------
+    profile : Profile
+        Profile.
+    fwhm : float
+        FWHM in px, of the window as well.
+
+    Returns
+    -------
+    Profile
+        The profile, moved and scaled at every place.
+    """
     over = profile.oversampling
     size = profile.coefficients.shape[-1]
     u = (np.arange(size) - (size - 1) // 2) / over

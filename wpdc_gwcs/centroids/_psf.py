@@ -5,10 +5,11 @@ import logging
 import numpy as np
 
 from wpdc_gwcs.centroids._blends import judge_profiles
-from wpdc_gwcs.centroids._build import OVERSAMPLING, fit_moffat, learn_profile, vary_profile
+from wpdc_gwcs.centroids._build import OVERSAMPLING, fit_moffat, learn_profile
 from wpdc_gwcs.centroids._fit import fit_radius, fit_stars
 from wpdc_gwcs.centroids._noise import Noise
 from wpdc_gwcs.centroids._profile import Profile, moffat_samples
+from wpdc_gwcs.centroids._variation import vary_profile
 from wpdc_gwcs.centroids._wings import with_wings
 from wpdc_gwcs.threads import one_blas_thread
 

@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from wpdc_gwcs.lookup._smoother import (
     pilot_surface,
     smooth_surface,
 )
+from wpdc_gwcs.threads import map_threads, one_blas_thread
 
 __all__ = [
     "MIN_STARS_TABLE",
@@ -71,6 +73,7 @@ def carries_table(residual_map):
     return int(np.sum(join_bins(residual_map).counts > 0)) >= _MIN_BINS_TABLE
 
 
+@one_blas_thread
 def choose_table(residual_map, *, lut="auto"):
     """Kernel, degree and smoothing of a look-up table, chosen from the data.
 
@@ -133,7 +136,8 @@ def _choose(coarse, *, allow_none):
     del quintic
 
     def try_all(kernels):
-        return [c for k in kernels for c in best_of(Spectrum(bins, *k), value)]
+        found = map_threads(lambda kernel: best_of(Spectrum(bins, *kernel), value), kernels)
+        return list(chain.from_iterable(found))
 
     broad = try_all(BROAD_KERNELS)
     narrow += try_all(OPEN_KERNELS)
@@ -259,9 +263,12 @@ def _cross_validate(coarse, candidates, pilot):
         train, test = Bins(coarse.without(fold)), Bins(coarse.only(fold))
         value, truth = train.debiased(pilot), test.debiased(pilot)
         n += 2 * len(test)
-        for k, candidate in enumerate(candidates):
+
+        def error_of(candidate, train=train, test=test, value=value, truth=truth):
             predicted = 0.0
             if candidate.kernel != "none":
                 predicted = smooth_surface(train, value, candidate)(test.u, test.v)
-            total[k] += np.sum((truth - predicted) ** 2 * test.weight[:, None])
+            return np.sum((truth - predicted) ** 2 * test.weight[:, None])
+
+        total += map_threads(error_of, candidates)
     return total / n

@@ -275,7 +275,7 @@ def fit_smooth_map(
     u, v = (x - center[0]) / scale, (y - center[1]) / scale
     target = np.column_stack([x_ref - x, y_ref - y])
     used = np.ones(len(x), bool)
-    fit = None
+    fit, whole = None, np.empty((0, 0))
     for _ in range(8):
         count = np.count_nonzero(used)
         few = count < PAIRS_PER_TERM * count_terms(_NARROW_ORDER + 1)
@@ -286,7 +286,10 @@ def fit_smooth_map(
             top += 1
         if top == 0:
             return fit
-        design = _design(u, v, top)[:, columns[: size[top]]]
+        # Fewer pairs seldom carry a higher order: those of a narrow frame may.
+        if whole.shape[1] < count_terms(top):
+            whole = _design(u, v, top)
+        design = whole[:, columns[: size[top]]]
         q, r = np.linalg.qr(design[used])
         diagonal = np.abs(np.diag(r))
         if diagonal[:3].min() < 1e-4 * diagonal[0]:
@@ -300,8 +303,9 @@ def fit_smooth_map(
         for order in range(1, top + 1):
             of_order = slice(size[order - 1] if order > 1 else 0, size[order])
             residual = residual - q[:, of_order] @ projected[of_order]
-            leverage = leverage + (q[:, of_order] ** 2).sum(axis=1)
-            errors.append(((residual / (1 - np.minimum(leverage, 0.99))[:, None]) ** 2).sum(axis=1))
+            leverage = leverage + np.einsum("ij,ij->i", q[:, of_order], q[:, of_order])
+            left_out = residual.T / (1 - np.minimum(leverage, 0.99))
+            errors.append(left_out[0] ** 2 + left_out[1] ** 2)
         errors = np.array(errors)
         variances = np.maximum(np.median(errors, axis=1) / (2 * np.log(2)), SMALLEST_SCATTER**2)
         score = np.minimum(errors, clip**2 * variances.min()).mean(axis=1)
@@ -312,7 +316,7 @@ def fit_smooth_map(
         coefficients = np.zeros((2, count_terms(order)))
         coefficients[:, columns] = fitted.T
         scatter = float(np.sqrt(variances[order - 1]))
-        squared = ((target - design[:, :terms] @ fitted) ** 2).sum(axis=1)
+        squared = np.sum((target - design[:, :terms] @ fitted).T ** 2, axis=0)
         squared[used] = errors[order - 1]
         fit = SmoothFit(
             SmoothMap(order, coefficients, np.asarray(center, float), float(scale)),

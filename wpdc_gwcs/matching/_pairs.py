@@ -5,13 +5,14 @@ from scipy.spatial import cKDTree
 
 __all__ = ["find_edges", "find_nearest", "one_to_one", "pair_nearest"]
 
-# Minimum number of points for a second thread.
-_THREADED = 20_000
+# Minimum number of neighbors to find for a second thread.
+_THREADED = 60_000
 
 
 def find_nearest(tree, points, k, **options):
     """Query a tree with a useful number of threads."""
-    return tree.query(points, k=k, workers=2 if len(points) > _THREADED else 1, **options)
+    workers = 2 if len(points) * np.max(k) > _THREADED else 1
+    return tree.query(points, k=k, workers=workers, **options)
 
 
 def find_edges(points, tree, radius, *, limit=None, slack=1.0):

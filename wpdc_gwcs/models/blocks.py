@@ -6,12 +6,12 @@
 """
 
 import math
-import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
 from astropy.utils.masked import Masked
+
+from wpdc_gwcs.threads import count_threads, map_threads
 
 __all__ = ["BLOCK_SIZE", "evaluate_blocks", "run_blocks"]
 
@@ -25,18 +25,10 @@ _THREADED_BLOCK_SIZE = 131072
 # Below this many points the threads cost more than they bring.
 _THREADED_SIZE = 65536
 
-_MAX_THREADS = 4
-
 # glibc hands freed memory back to the system, and faults it in again for the next block, unless it
 # has seen a block of up to 32 MB come and go: then it keeps twice as much.  Elsewhere this does
 # nothing.
 _KEEP_BYTES = 31 * 2**20
-
-
-def _n_threads():
-    if hasattr(os, "sched_getaffinity"):
-        return min(_MAX_THREADS, len(os.sched_getaffinity(0)))
-    return min(_MAX_THREADS, os.cpu_count() or 1)
 
 
 @cache
@@ -57,7 +49,7 @@ def run_blocks(function, size, *, weight=1):
         Points in each element, for example the length of a row.
     """
     _keep_freed_memory()
-    n_threads = _n_threads() if size * weight >= _THREADED_SIZE else 1
+    n_threads = count_threads() if size * weight >= _THREADED_SIZE else 1
     if n_threads == 1:
         step = max(1, BLOCK_SIZE // weight)
     else:
@@ -75,10 +67,8 @@ def run_blocks(function, size, *, weight=1):
         for start in starts[first::n_threads]:
             function(start, min(start + step, size))
 
-    # A pool of its own for each call: nothing outlives the call, so forked children and nested
-    # calls are safe, and starting two threads costs less than one block.
-    with ThreadPoolExecutor(n_threads) as pool:
-        list(pool.map(work, range(n_threads)))
+    # Starting two threads costs less than one block.
+    map_threads(work, range(n_threads))
 
 
 def evaluate_blocks(function, *inputs, n_outputs=2):

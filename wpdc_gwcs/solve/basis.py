@@ -6,7 +6,7 @@ import numpy as np
 
 from wpdc_gwcs.solve.terms import legendre_products
 
-__all__ = ["BEND_DEGREES", "Basis", "patch"]
+__all__ = ["BEND_DEGREES", "Basis", "inner_products", "patch"]
 
 # The patch is this much larger than the part of the focal plane where stars are used: the waves
 # vanish at its edge.
@@ -56,6 +56,27 @@ class Basis:
             M or 2 M waves first, then 14 polynomials if there are bends, degree by degree along
             each axis; the last two are a constant along each axis.
         """
+        parts = self.along(focal, kind)
+        out = np.zeros((1 + max(mine.max() for mine, _ in parts), 2, focal.shape[1]))
+        for a, (mine, rows) in enumerate(parts):
+            out[mine, a] = rows
+        return out
+
+    def along(self, focal, kind="curl-free"):
+        """Displacements of unit coefficients along each axis, without those that are zero there.
+
+        Parameters
+        ----------
+        focal : (2, N) ndarray
+            Focal plane, px.
+        kind : {'curl-free', 'axes'}, optional
+            As of `shapes`.
+
+        Returns
+        -------
+        list of (ndarray, ndarray)
+            For each axis the numbers of the coefficients ``(m,)`` and displacements ``(m, N)``.
+        """
         phases = [
             np.outer(
                 np.arange(self.orders[a].max() + 1),
@@ -65,31 +86,53 @@ class Basis:
         ]
         m = self.orders.shape[1]
         norm = 1.0 / np.sqrt(np.prod(self.half))
-        size = m if kind == "curl-free" else 2 * m
         bends = self._bends(focal)
         p = len(bends)
-        out = np.zeros((size + 2 * p + 2, 2, focal.shape[1]))
+        size = m if kind == "curl-free" else 2 * m
         sines = [np.sin(phase) for phase in phases]
-        if kind == "curl-free":
-            wave = self.wave * norm
-            for a in range(2):
-                along = np.cos(phases[a])[self.orders[a]]
-                along *= wave[a][:, None]
-                np.multiply(along, sines[1 - a][self.orders[1 - a]], out=out[:m, a])
-        else:
-            first = sines[0][self.orders[0]]
-            first *= norm
-            np.multiply(first, sines[1][self.orders[1]], out=out[:m, 0])
-            out[m : 2 * m, 1] = out[:m, 0]
-        out[size : size + p, 0] = out[size + p : size + 2 * p, 1] = bends
-        out[-2, 0] = out[-1, 1] = 1.0
-        return out
+        parts = []
+        for a in range(2):
+            rows = np.empty((m + p + 1, focal.shape[1]))
+            if kind == "curl-free":
+                waves = np.cos(phases[a])[self.orders[a]]
+                waves *= (self.wave[a] * norm)[:, None]
+                np.multiply(waves, sines[1 - a][self.orders[1 - a]], out=rows[:m])
+            elif a == 0:
+                np.multiply(sines[0][self.orders[0]], sines[1][self.orders[1]], out=rows[:m])
+                rows[:m] *= norm
+            else:
+                rows[:m] = parts[0][1][:m]
+            rows[m:-1], rows[-1] = bends, 1.0
+            first = 0 if kind == "curl-free" else a * m
+            mine = [first + np.arange(m), size + a * p + np.arange(p), [size + 2 * p + a]]
+            parts.append((np.concatenate(mine), rows))
+        return parts
 
     def _bends(self, focal):
         if not self.bends:
             return np.zeros((0, focal.shape[1]))
         place = (focal - self.center[:, None]) / (self.half[:, None] / _PATCH)
         return legendre_products(*place, BEND_DEGREES[0], BEND_DEGREES[-1])
+
+
+def inner_products(parts):
+    """Products of shapes with each other, summed over stars and axes.
+
+    Parameters
+    ----------
+    parts : list of (ndarray, ndarray)
+        As from `Basis.along`, weighted.
+
+    Returns
+    -------
+    (K, K) ndarray
+        Symmetric.
+    """
+    n = 1 + max(mine.max() for mine, _ in parts)
+    total = np.zeros((n, n))
+    for mine, rows in parts:
+        total[np.ix_(mine, mine)] += rows @ rows.T
+    return total
 
 
 def patch(low, high, n_waves, *, bends=False):

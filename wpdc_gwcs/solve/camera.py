@@ -24,6 +24,7 @@ from wpdc_gwcs.solve.state import (
 )
 from wpdc_gwcs.solve.stored import StoredMap, unswallowed_maps, updated_solution
 from wpdc_gwcs.solve.tables import choose_tables, folds, residual_maps, with_tables
+from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["solve"]
 
@@ -55,6 +56,7 @@ _REFINE = ("auto", "attitude", "field", "pv")
 _LUT = ("auto", "always", "none")
 
 
+@one_blas_thread
 def solve(
     exposures,
     *,

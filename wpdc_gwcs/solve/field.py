@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve, lapack
 
-from wpdc_gwcs.solve.basis import Basis
+from wpdc_gwcs.solve.basis import Basis, inner_products
 from wpdc_gwcs.solve.spectrum import Spectrum
 
 __all__ = ["Field", "fit_field"]
@@ -148,14 +148,14 @@ def fit_field(basis, spectrum, focal, residual, variance):
     """
     weight = 1.0 / (variance + spectrum.unresolved(basis))
     root = np.sqrt(spectrum.prior(basis))
-    shapes = basis.shapes(focal, spectrum.kind)
-    shapes = shapes.reshape(len(shapes), -1)
-    shapes *= root[:, None]
-    shapes *= np.sqrt(weight.ravel())
-    inner = shapes @ shapes.T
+    parts, right = basis.along(focal, spectrum.kind), np.zeros(len(root))
+    for a, (mine, rows) in enumerate(parts):
+        rows *= root[mine, None]
+        rows *= np.sqrt(weight[a])
+        right[mine] += rows @ (np.sqrt(weight[a]) * residual[a])
+    inner = inner_products(parts)
     inner[np.diag_indices_from(inner)] += 1.0
     lower, _ = lapack.dpotrf(inner, lower=1, clean=1)
-    right = shapes @ (np.sqrt(weight) * residual).ravel()
     coefficients = root * lapack.dpotrs(lower, right, lower=1)[0]
     inverse, _ = lapack.dtrtri(lower, lower=1)
     freedom = (len(root) - np.sum(inverse**2)) / max(focal.shape[1], 1)

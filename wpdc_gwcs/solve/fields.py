@@ -122,7 +122,7 @@ def _products(o, state, f, basis: Basis, kinds):
     nuisance = None
     if len(o.detectors) == 1:
         # The polynomial of a single exposure has absorbed a part of the field.
-        columns = design(state.model, o, f, o.x[s][kept], o.y[s][kept], o.color[s][kept])
+        columns = design(state.model, o, f, o.x[s][kept], o.y[s][kept], o.color[s][kept]).rows
         own = sum(t.size for t in state.model.scoped("exposure"))
         nuisance = columns if o.n_exposures == 1 else columns[:, :, -own:]
     return products(

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from wpdc_gwcs.solve.geometry import Geometry
-from wpdc_gwcs.solve.terms import Block
+from wpdc_gwcs.solve.terms import Block, Design
 
 __all__ = ["Model", "design", "focal_variance", "residuals", "undistorted"]
 
@@ -227,13 +227,13 @@ def design(model, observations, frame, x, y, color=None):
 
     Returns
     -------
-    (2, N, S + K) ndarray
+    Design
         Px of the focal plane per unit of each unknown.
     """
     k = observations.detector_of[frame]
     b, _ = block(model, k, observations.detectors[k], x, y, color)
     ordered = model.scoped("camera") + model.scoped("detector") + model.scoped("exposure")
-    return np.concatenate([t.design(b) for t in ordered], axis=2)
+    return Design.joined([t.design(b) for t in ordered])
 
 
 def focal_variance(model, observations, frame, sigma):

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
+from wpdc_gwcs.solve.basis import inner_products
+
 __all__ = [
     "Blocks",
     "Posterior",
@@ -56,31 +58,39 @@ def frame_equations(design, residual, weight, *, field=None):
 
     Parameters
     ----------
-    design : (2, N, P) ndarray
-        Columns of the unknowns.
+    design : Design
+        Columns of the P unknowns at N stars.
     residual, weight : (2, N) ndarray
         Residuals and inverse variances, px.
-    field : (shapes, prior), optional
-        Shapes ``(M, 2, N)`` and prior variances ``(M,)`` of the frame's field, which is
-        marginalized: the noise covariance becomes diag(1 / weight) + shapes^T prior shapes.
+    field : (parts, prior), optional
+        Shapes of the frame's field along each axis, as from `Basis.along`, and their prior
+        variances ``(M,)``.  It is marginalized: the noise covariance becomes
+        diag(1 / weight) + shapes^T prior shapes.
 
     Returns
     -------
     matrix, right : (P, P) and (P,) ndarray
         Normal matrix and right-hand side.
     """
-    n = design.shape[2]
-    root = np.sqrt(weight.ravel())
-    both = np.vstack([np.moveaxis(design, -1, 0).reshape(n, -1), residual.ravel()]) * root
-    products = both @ both.T
+    _, p, n = design.mix.shape
+    root = np.sqrt(weight)
+    # The residual is one more column, and a shape of its own.
+    mix = np.zeros((2, p + 1, n + 1))
+    mix[:, :p, :n], mix[:, p, n] = design.mix, 1.0
+    rows = [np.vstack([design.shapes, residual[a]]) * root[a] for a in range(2)]
+    products = sum(m.T @ (r @ r.T) @ m for m, r in zip(mix, rows))
     if field is not None:
-        shapes, prior = field
-        heavy = shapes.reshape(len(shapes), -1) * np.sqrt(prior)[:, None]
-        heavy *= root
-        inner = heavy @ heavy.T
+        parts, prior = field
+        heavy = []
+        for a, (mine, shapes) in enumerate(parts):
+            heavy.append((mine, shapes * np.sqrt(prior[mine])[:, None]))
+            heavy[a][1][:] *= root[a]
+        inner, cross = inner_products(heavy), np.zeros((len(prior), n + 1))
+        for a, (mine, shapes) in enumerate(heavy):
+            cross[mine] += shapes @ rows[a].T @ mix[a]
         inner[np.diag_indices_from(inner)] += 1.0
         factor, _ = lapack.dpotrf(inner, lower=1)
-        half, _ = lapack.dtrtrs(factor, heavy @ both.T, lower=1)
+        half, _ = lapack.dtrtrs(factor, cross, lower=1)
         products = products - half.T @ half
     return products[:n, :n], products[:n, n]
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import lapack
 from scipy.optimize import minimize
 
-from wpdc_gwcs.solve.basis import BEND_DEGREES, Basis
+from wpdc_gwcs.solve.basis import BEND_DEGREES, Basis, inner_products
 
 __all__ = ["Products", "Spectrum", "learn_spectra", "pooled_spectrum", "products"]
 
@@ -127,15 +127,15 @@ class Products:
     ----------
     basis : Basis
         Waves.
-    matrix, right : dict
-        For each kind of field, normal matrix and right-hand side.
+    blocks : dict
+        For each kind of field, sets of coefficients that are independent of each other: their
+        numbers, normal matrix and right-hand side.
     n_stars : int
         Number of stars.
     """
 
     basis: Basis
-    matrix: dict
-    right: dict
+    blocks: dict
     n_stars: int
 
     def log_evidence(self, spectrum):
@@ -151,14 +151,17 @@ class Products:
         float
             Log evidence, nats.
         """
-        root = np.sqrt(spectrum.prior(self.basis))
-        inner = self.matrix[spectrum.kind] * root[:, None] * root
-        inner[np.diag_indices_from(inner)] += 1.0
-        factor, info = lapack.dpotrf(inner, lower=1, overwrite_a=1)
-        if info != 0:
-            return -np.inf
-        half, _ = lapack.dtrtrs(factor, self.right[spectrum.kind] * root, lower=1)
-        return float(0.5 * half @ half - np.sum(np.log(np.diagonal(factor))))
+        scale, total = np.sqrt(spectrum.prior(self.basis)), 0.0
+        for mine, matrix, right in self.blocks[spectrum.kind]:
+            root = scale[mine]
+            inner = matrix * root[:, None] * root
+            inner[np.diag_indices_from(inner)] += 1.0
+            factor, info = lapack.dpotrf(inner, lower=1, overwrite_a=1)
+            if info != 0:
+                return -np.inf
+            half, _ = lapack.dtrtrs(factor, right * root, lower=1)
+            total += 0.5 * half @ half - np.sum(np.log(np.diagonal(factor)))
+        return float(total)
 
 
 def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
@@ -180,24 +183,35 @@ def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
     Products
         Products for `learn_spectra`.
     """
-    matrix, right = {}, {}
-    w = weight.ravel()
-    r = residual.ravel()
+    root = np.sqrt(weight)
+    target, together = root * residual, False
+    if nuisance is not None:
+        free = nuisance * root[:, :, None]
+        columns = free.reshape(-1, free.shape[2])
+        normal, free_right = columns.T @ columns, columns.T @ target.ravel()
+        together = bool(np.any(free != 0, axis=1).all(axis=0).any())
+    blocks = {}
     for kind in kinds:
-        shapes = basis.shapes(focal, kind)
-        shapes = shapes.reshape(len(shapes), -1) * np.sqrt(w)
-        g, h = shapes @ shapes.T, shapes @ (np.sqrt(w) * r)
-        if nuisance is not None:
-            free = nuisance.reshape(-1, nuisance.shape[2])
-            cross = (shapes @ (free * np.sqrt(w)[:, None])).T
-            normal = (free * w[:, None]).T @ free
-            solved = np.linalg.lstsq(
-                normal, np.column_stack([cross, (free * w[:, None]).T @ r]), rcond=1e-12
-            )[0]
-            g = g - cross.T @ solved[:, :-1]
-            h = h - cross.T @ solved[:, -1]
-        matrix[kind], right[kind] = g, h
-    return Products(basis, matrix, right, focal.shape[1])
+        parts = basis.along(focal, kind)
+        # Where nothing moves stars along both axes, each axis stands by itself.
+        groups = [(0,), (1,)] if kind == "axes" and not together else [(0, 1)]
+        blocks[kind] = []
+        for axes in groups:
+            numbers = np.unique(np.concatenate([parts[a][0] for a in axes]))
+            mine = [(np.searchsorted(numbers, parts[a][0]), parts[a][1] * root[a]) for a in axes]
+            matrix, right = inner_products(mine), np.zeros(len(numbers))
+            for a, (k, rows) in zip(axes, mine):
+                right[k] += rows @ target[a]
+            if nuisance is not None:
+                cross = np.zeros((len(normal), len(numbers)))
+                for a, (k, rows) in zip(axes, mine):
+                    cross[:, k] += (rows @ free[a]).T
+                both = np.column_stack([cross, free_right])
+                solved = np.linalg.lstsq(normal, both, rcond=1e-12)[0]
+                matrix = matrix - cross.T @ solved[:, :-1]
+                right = right - cross.T @ solved[:, -1]
+            blocks[kind].append((numbers, matrix, right))
+    return Products(basis, blocks, focal.shape[1])
 
 
 def learn_spectra(frames, make, *, start, scales, force=False):
@@ -255,11 +269,11 @@ def _is_common(patches, spectrum):
     for basis in {id(p.basis): p.basis for p in patches}.values():
         mine = [p for p in patches if p.basis is basis]
         if len(mine) > 1:
-            matrix, right = (
-                {spectrum.kind: sum(getattr(p, part)[spectrum.kind] for p in mine)}
-                for part in ("matrix", "right")
-            )
-            together = Products(basis, matrix, right, sum(p.n_stars for p in mine))
+            blocks = [
+                (of_all[0][0], *(sum(one[part] for one in of_all) for part in (1, 2)))
+                for of_all in zip(*(p.blocks[spectrum.kind] for p in mine), strict=True)
+            ]
+            together = Products(basis, {spectrum.kind: blocks}, sum(p.n_stars for p in mine))
             each += sum(p.log_evidence(spectrum) for p in mine)
             common += together.log_evidence(spectrum)
     return common > each

@@ -124,14 +124,14 @@ def _products(o, state):
         kept = state.kept[s]
         residual, focal = residuals(model, o, f, with_field=False)
         variance = state.noise(o, f)[:, kept]
-        rows = design(model, o, f, o.x[s][kept], o.y[s][kept], o.color[s][kept])
+        columns = design(model, o, f, o.x[s][kept], o.y[s][kept], o.color[s][kept])
         k, e = int(o.detector_of[f]), int(o.exposure_of[f])
         spectrum = state.spectrum(o, f)
         marginal = None
         if spectrum is not None:
             basis = state.bases[k]
-            marginal = basis.shapes(focal[:, kept], spectrum.kind), spectrum.prior(basis)
-        yield k, e, *frame_equations(rows, -residual[:, kept], 1.0 / variance, field=marginal)
+            marginal = basis.along(focal[:, kept], spectrum.kind), spectrum.prior(basis)
+        yield k, e, *frame_equations(columns, -residual[:, kept], 1.0 / variance, field=marginal)
 
 
 def linear_step(o, state, *, learn=10, pool=True):
@@ -449,7 +449,7 @@ def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrume
     """
     model, found = state.model, state.posterior
     k, e = int(o.detector_of[frame]), int(o.exposure_of[frame])
-    rows = design(model, o, frame, x, y)
+    rows = design(model, o, frame, x, y).rows
     extra = np.zeros((2, 2, len(x)))
     if frame in model.fields and not instrument_only:
         rows, extra = _with_field(o, state, frame, x, y, rows)
@@ -491,6 +491,6 @@ def _with_field(o, state, frame, x, y, rows):
     k = int(o.detector_of[frame])
     _, focal = block(model, k, o.detectors[k], x, y)
     _, focal_stars = residuals(model, o, frame)
-    stars = design(model, o, frame, o.x[s][kept], o.y[s][kept])
+    stars = design(model, o, frame, o.x[s][kept], o.y[s][kept]).rows
     weight = 1.0 / focal_variance(model, o, frame, state.sigma[:, s][:, kept])
     return posterior_field.conditioned(focal, rows, focal_stars[:, kept], stars, weight)

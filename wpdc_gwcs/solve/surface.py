@@ -3,7 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+
+from wpdc_gwcs.models.blocks import evaluate_blocks
+from wpdc_gwcs.models.cells import spline_cells
+from wpdc_gwcs.models.mapping import PlaneMap
 
 __all__ = ["SampledField", "SummedField", "TableSurface", "of_field", "of_table"]
 
@@ -17,15 +20,15 @@ _BEYOND = 2
 
 @dataclass(frozen=True, eq=False)
 class TableSurface:
-    """Displacements of a look-up table, the same bicubic spline.
+    """Displacements of a look-up table, the same spline.
 
     Parameters
     ----------
-    splines : tuple of RectBivariateSpline
-        Splines of both axes, as functions of (x, y).
+    plane_map : PlaneMap
+        Map from (x, y) to both displacements.
     """
 
-    splines: tuple
+    plane_map: PlaneMap
 
     def __call__(self, x, y):
         """Return the displacement of pixels.
@@ -40,7 +43,7 @@ class TableSurface:
         (2, N) ndarray
             Px.
         """
-        return np.array([spline(x, y, grid=False) for spline in self.splines])
+        return np.array(evaluate_blocks(self.plane_map.evaluate, x, y))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +136,7 @@ class SummedField:
 
 
 def of_table(table):
-    """Convert a look-up table to splines that are set up once.
+    """Convert a look-up table to cells that are set up once.
 
     Parameters
     ----------
@@ -145,13 +148,7 @@ def of_table(table):
     TableSurface
         The same displacements.
     """
-    degree = 3 if table.method == "cubic" else 1
-    return TableSurface(
-        tuple(
-            RectBivariateSpline(table.x_grid, table.y_grid, np.asarray(d).T, kx=degree, ky=degree)
-            for d in (table.dx, table.dy)
-        )
-    )
+    return TableSurface(PlaneMap(grid=table._cells()))
 
 
 def of_field(field, low, high, *, least_steps=1):
@@ -175,6 +172,6 @@ def of_field(field, low, high, *, least_steps=1):
     shortest = 2 * np.pi / np.abs(field.wave).max(axis=1)
     steps = np.maximum(np.ceil(_NODES_PER_WAVE * size / shortest).astype(int), least_steps)
     grids = [a + s / n * np.arange(-_BEYOND, n + _BEYOND + 1) for a, s, n in zip(low, size, steps)]
-    x, y = np.meshgrid(*grids, indexing="ij")
+    x, y = np.meshgrid(*grids)
     values = field(np.array([x.ravel(), y.ravel()])).reshape(2, *x.shape)
-    return SampledField(field, TableSurface(tuple(RectBivariateSpline(*grids, v) for v in values)))
+    return SampledField(field, TableSurface(PlaneMap(grid=spline_cells(*grids, values))))

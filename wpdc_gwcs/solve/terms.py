@@ -12,6 +12,7 @@ import numpy as np
 
 __all__ = [
     "Block",
+    "Design",
     "Term",
     "attitude",
     "lateral_color",
@@ -117,16 +118,58 @@ class Term:
 
         Returns
         -------
-        (2, N, K) ndarray
+        Design
             Px of the focal plane.
         """
-        shapes = self.shapes(block)
-        p, n = shapes.shape
-        each = np.zeros((2 * p, 2, n))
-        each[:p, 0] = each[p:, 1] = shapes
-        if self.mix is not None:
-            each = (self.mix.T @ each.reshape(2 * p, -1)).reshape(-1, 2, n)
-        return np.moveaxis(each, 0, -1)
+        each = np.eye(self.size) if self.mix is None else self.mix
+        return Design(self.shapes(block), each.reshape(2, -1, self.size))
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Displacements of unit coefficients, in factors.
+
+    Coefficient k moves star n by ``mix[a, p, k] shapes[p, n]``, summed over p, along axis a.  There
+    are half as many shapes as coefficients, or fewer: products of shapes take a quarter of the time
+    of products of columns, most of which are zero along one axis.
+
+    Parameters
+    ----------
+    shapes : (p, N) ndarray
+        Functions of the place.
+    mix : (2, p, K) ndarray
+        What each coefficient gives of each shape, along both axes.
+    """
+
+    shapes: np.ndarray
+    mix: np.ndarray
+
+    @classmethod
+    def joined(cls, parts):
+        """Put the coefficients of several designs side by side.
+
+        Parameters
+        ----------
+        parts : sequence of Design
+            Of the same stars.
+
+        Returns
+        -------
+        Design
+            Of all coefficients.
+        """
+        mix = np.zeros((2, *np.sum([part.mix.shape[1:] for part in parts], axis=0)))
+        p = k = 0
+        for part in parts:
+            _, q, m = part.mix.shape
+            mix[:, p : p + q, k : k + m] = part.mix
+            p, k = p + q, k + m
+        return cls(np.concatenate([part.shapes for part in parts]), mix)
+
+    @property
+    def rows(self):
+        """The displacements themselves, ``(2, N, K)``."""
+        return np.moveaxis(np.tensordot(self.mix, self.shapes, (1, 0)), 1, 2)
 
 
 # Expected ratio of one degree of a polynomial to the degree before.

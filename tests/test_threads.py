@@ -1,0 +1,36 @@
+"""Threads change nothing but the time."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from wpdc_gwcs.threads import count_threads, map_threads
+
+
+def test_results_come_in_the_order_of_the_items(monkeypatch):
+    monkeypatch.setattr("wpdc_gwcs.threads.count_threads", lambda: 3)
+    matrices = np.random.default_rng(1).normal(size=(20, 30, 30))
+    expected = [np.linalg.det(matrix) for matrix in matrices]
+    assert map_threads(np.linalg.det, iter(matrices)) == expected
+    assert map_threads(np.linalg.det, []) == []
+
+
+def test_items_are_worked_on_at_the_same_time(monkeypatch):
+    monkeypatch.setattr("wpdc_gwcs.threads.count_threads", lambda: 2)
+    both = threading.Barrier(2, timeout=30)
+    assert sorted(map_threads(lambda _: both.wait(), "ab")) == [0, 1]
+
+
+def test_one_item_stays_in_its_thread():
+    assert map_threads(lambda _: threading.current_thread(), "a") == [threading.current_thread()]
+
+
+def test_errors_come_through(monkeypatch):
+    monkeypatch.setattr("wpdc_gwcs.threads.count_threads", lambda: 2)
+    with pytest.raises(ZeroDivisionError):
+        map_threads(lambda value: 1 / value, [1, 0, 2])
+
+
+def test_threads_are_few():
+    assert 1 <= count_threads() <= 4
