@@ -1,5 +1,6 @@
 """The reproduction of the paper: its numbers, and a small run of each part."""
 
+from dataclasses import replace
 from inspect import signature
 
 import astropy.units as u
@@ -139,6 +140,15 @@ def test_cluster_in_two_processes(made, tmp_path):
     for quantity in ("sigma_dx", "wcs_rms", "n_stars"):
         expected = value(made[1][made[1]["part"] == "cluster"], "g-1", quantity)
         assert value(results, "g-1", quantity) == pytest.approx(expected, rel=1e-3)
+
+
+def test_detectors_in_two_processes(made, tmp_path):
+    scale = replace(SMALL, detectors=SMALL.detectors[:2])
+    results = reproduce(("detectors",), tmp_path, scale=scale, seed=1, jobs=2)
+    for item in scale.detectors:
+        for quantity in ("sigma_dx", "wcs_rms", "n_stars"):
+            expected = value(made[1][made[1]["part"] == "detectors"], item, quantity)
+            assert value(results, item, quantity) == pytest.approx(expected, rel=1e-3)
 
 
 def test_parts_that_are_done_are_kept(tmp_path, monkeypatch):

@@ -30,7 +30,7 @@ def reproduce_command(
         bool,
         typer.Option("--quick", help="Small detectors and few fields: minutes instead of hours."),
     ] = False,
-    jobs: Annotated[int, typer.Option(metavar="N", help="Processes that match frames.")] = 1,
+    jobs: Annotated[int, typer.Option(metavar="N", help="Processes that work at a time.")] = 1,
     # SEED of the reproduction, which is imported only when needed.
     seed: Annotated[
         int, typer.Option(metavar="N", help="Another seed gives another camera.")

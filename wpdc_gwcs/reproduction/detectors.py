@@ -6,7 +6,11 @@
                                                                   --> score_frame (error of the WCS)
 """
 
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
+from typing import NamedTuple
 
 import numpy as np
 from astropy.table import QTable
@@ -118,7 +122,7 @@ def reproduce_detectors(folder, scale, *, seed=SEED, jobs=1, progress=None):
     seed : int, optional
         Seed of the camera and of the fields.
     jobs : int, optional
-        Number of processes that match frames.
+        Number of processes, each with one detector at a time.
     progress : callable, optional
         Called as ``progress("detectors", done, total)``.
 
@@ -133,24 +137,14 @@ def reproduce_detectors(folder, scale, *, seed=SEED, jobs=1, progress=None):
     ``focal-plane.png``, and ``before-after-g-1-literal.png`` and ``-ours.png``.
     """
     found, pooled, shown = {}, {name: [] for name in METHODS}, []
-    for done, detector in enumerate(scale.detectors):
-        simulation = simulate_fields(detector, scale, seed=seed)
-        numbers = {}
-        for name, method in METHODS.items():
-            run = calibrate_fields(simulation, scale, method=method, jobs=jobs)
-            residuals = pool_residuals(run.calibrations, limit=CLOSE_PX)[0]
-            pooled[name].append(residuals)
-            numbers[name] = _quantities(residuals, pool_scores(score_run(simulation, run))[0])
-            if detector == _SHOWN:
-                numbers[name] |= _draw_shown(run, name, folder)
-            if name == "ours":
-                shown.append(run.calibrations[0])
-            # From here on, only the solution of the literal method is needed.
-            del run
-        size = simulation.distortion.greatest()
-        found[detector, "largest_distortion", "pix"] = (size, size)
-        for quantity, unit in numbers["ours"]:
-            values = [numbers[name].get((quantity, unit), np.nan) for name in METHODS]
+    made = _in_processes(partial(_reproduce_one, folder, scale, seed), scale.detectors, jobs)
+    for done, (detector, one) in enumerate(zip(scale.detectors, made, strict=True)):
+        for name in METHODS:
+            pooled[name].append(one.residuals[name])
+        shown.append(one.shown)
+        found[detector, "largest_distortion", "pix"] = (one.distortion, one.distortion)
+        for quantity, unit in one.numbers["ours"]:
+            values = [one.numbers[name].get((quantity, unit), np.nan) for name in METHODS]
             found[detector, quantity, unit] = values
         if progress is not None:
             progress("detectors", done + 1, len(scale.detectors))
@@ -162,6 +156,45 @@ def reproduce_detectors(folder, scale, *, seed=SEED, jobs=1, progress=None):
                 temporary.write_text(format_table(residuals, form=form), encoding="utf-8")
     _draw_focal_plane(shown, scale, seed, folder)
     return tabulate_results("detectors", found)
+
+
+class _Detector(NamedTuple):
+    """Results of one detector: numbers and residuals by method, and a frame for the figure."""
+
+    numbers: dict
+    residuals: dict
+    shown: object
+    distortion: float
+
+
+def _reproduce_one(folder, scale, seed, detector):
+    """Calibrate one detector with both methods."""
+    simulation = simulate_fields(detector, scale, seed=seed)
+    numbers, pooled = {}, {}
+    for name, method in METHODS.items():
+        run = calibrate_fields(simulation, scale, method=method)
+        pooled[name] = pool_residuals(run.calibrations, limit=CLOSE_PX)[0]
+        numbers[name] = _quantities(pooled[name], pool_scores(score_run(simulation, run))[0])
+        if detector == _SHOWN:
+            numbers[name] |= _draw_shown(run, name, folder)
+        if name == "ours":
+            shown = run.calibrations[0]
+        # From here on, only the residuals are needed of the rest.
+        del run
+    return _Detector(numbers, pooled, shown, simulation.distortion.greatest())
+
+
+def _in_processes(function, values, jobs):
+    """Results of a function, in the order of the values, by several processes at a time."""
+    if jobs == 1:
+        yield from map(function, values)
+        return
+    with ProcessPoolExecutor(min(jobs, len(values)), mp_context=get_context("spawn")) as pool:
+        try:
+            yield from pool.map(function, values)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _draw_shown(run, name, folder):
