@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial import KDTree
 
+from wpdc_gwcs.centroids._build import rank_in_parts
 from wpdc_gwcs.centroids._inverses import inverses
 from wpdc_gwcs.centroids._joint import cross_products, pairs_that_share
 from wpdc_gwcs.centroids._modes import blur_modes, companions, odd_modes, reduced_normal
@@ -21,8 +22,6 @@ _ODDS, _KNOWN = 1.2, 0.017
 # Stars nearest in place, and the best measured of all, that tell how profiles differ.
 _NEAREST, _BEST = 25, 300
 _LEAST = 20
-# Parts along each axis, from which they come in turn.
-_PARTS = 6
 # Variance of a median over that of a mean.
 _MEDIAN_COST = 1.57
 # Outliers, in median absolute widths; and so few that both sides are needed.
@@ -191,17 +190,12 @@ def _best_everywhere(stars, clean, size):
 
     The best of all may be in one cluster, and tell nothing of a corner.
     """
-    places = np.column_stack([stars.x, stars.y])[clean]
-    low, high = places.min(axis=0), places.max(axis=0)
-    cells = (_PARTS * (places - low) / np.maximum(high - low, 1e-9) * (1 - 1e-9)).astype(int)
-    cell = cells[:, 0] * _PARTS + cells[:, 1]
     size = np.where(size > 0, size, np.inf)
-    order = np.lexsort([size, cell])
-    _, first, count = np.unique(cell[order], return_index=True, return_counts=True)
-    rank = np.empty(len(clean), int)
-    rank[order] = np.arange(len(clean)) - np.repeat(first, count)
+    clean = clean[np.argsort(size, kind="stable")]
+    places = np.column_stack([stars.x[clean], stars.y[clean]])
+    rank = rank_in_parts(places, places.min(axis=0), places.max(axis=0))
     n = int(np.clip(len(clean) // 4, _LEAST, _BEST))
-    return clean[np.lexsort([size, rank])[:n]]
+    return clean[np.argsort(rank, kind="stable")[:n]]
 
 
 def _common(stars, amplitude, covariance, best):

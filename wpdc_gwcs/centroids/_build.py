@@ -23,6 +23,7 @@ __all__ = [
     "fit_moffat",
     "isolated",
     "learn_profile",
+    "rank_in_parts",
     "select_stars",
 ]
 
@@ -34,6 +35,9 @@ _SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 # of its fourth differences (in units of a Gaussian's), and of itself.
 _ROUGHNESS = 0.4
 _DEVIATION = 0.3
+
+# Parts of a frame along each axis, which stars are taken from in turn.
+_PARTS = 6
 
 # FWHM in px of the finest structure from which knots every half pixel follow it as well as those
 # every quarter: to a thousandth for a Gaussian.  Wide profiles are quicker with them.
@@ -74,14 +78,34 @@ def select_stars(stars, snr, quality, fwhm, shape, *, n_max, min_snr):
     rows = rows[np.argsort(flux[rows])[::-1]]
     if len(rows) <= n_max:
         return rows
-    # The same number from each of 6 x 6 fields, as far as they have as many.
-    field = np.clip(6 * y[rows] / shape[0], 0, 5).astype(int) * 6
-    field += np.clip(6 * x[rows] / shape[1], 0, 5).astype(int)
-    order = np.argsort(field, kind="stable")
-    first = np.searchsorted(field[order], np.arange(36))
-    rank = np.empty(len(rows), int)
-    rank[order] = np.arange(len(rows)) - first[field[order]]
+    # The same number from each part of the frame, as far as they have as many.
+    places = np.column_stack([x[rows], y[rows]])
+    rank = rank_in_parts(places, np.zeros(2), np.array(shape[::-1]))
     return rows[np.sort(np.argsort(rank, kind="stable")[:n_max])]
+
+
+def rank_in_parts(places, low, high):
+    """Rank stars within the part of the area that they are in, one of 6 x 6.
+
+    Parameters
+    ----------
+    places : (N, 2) ndarray
+        Positions of the stars, the best star first.
+    low, high : (2,) ndarray
+        Corners of the area.
+
+    Returns
+    -------
+    (N,) int ndarray
+        Number of better stars in the same part.
+    """
+    side = (high - low) / _PARTS
+    column, row = np.clip((places - low) / np.maximum(side, 1e-9), 0, _PARTS - 1).astype(int).T
+    part = row * _PARTS + column
+    order = np.argsort(part, kind="stable")
+    rank = np.empty(len(part), int)
+    rank[order] = np.arange(len(part)) - np.searchsorted(part[order], part[order])
+    return rank
 
 
 def isolated(stars, fwhm):
