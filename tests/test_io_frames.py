@@ -633,6 +633,20 @@ def test_sources_that_are_there_twice(rng, offset):
     assert np.flatnonzero(np.isfinite(sources["x"])).tolist() == list(range(n))
 
 
+@pytest.mark.parametrize(("offset", "warns"), [(0.0, True), (0.01, False)])
+def test_chance_neighbors_are_noted_without_a_warning(rng, caplog, offset, warns):
+    n = 500
+    table = Table({"x": rng.uniform(0, 5000, n), "y": rng.uniform(0, 5000, n)})
+    table["x_err"] = table["y_err"] = 0.02
+    again = table[:2].copy()
+    again["x"] += offset
+    expected = pytest.warns(WPDCWarning, match="2 of 502") if warns else contextlib.nullcontext()
+    with expected, caplog.at_level("INFO", logger="wpdc_gwcs"):
+        sources = standardize_sources(vstack([table, again]))
+    assert np.isnan(sources["x"]).sum() == 2
+    assert ("2 of 502 rows repeat a source" in caplog.text) is not warns
+
+
 def test_cells_that_are_no_numbers():
     table = {"x": ["1.0", "bad", "3.0"], "y": [1.0, 2.0, 9.0], "snr": ["a", "b", "c"]}
     with (

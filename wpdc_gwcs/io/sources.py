@@ -108,6 +108,9 @@ _MARKS_OF_ONE = ("AN_FILE",)
 _ORIGIN_KEYS = ("PIXORIG", "PIX_ORIG", "PIXEL_ORIGIN", "XYORIGIN", "XYORIG", "PIXBASE", "INDEXING")
 # Sources are one if they are no further apart: what is closer is no two sources to anyone.
 _COPY_REACH = 1.0  # px
+# By chance, a few sources in a thousand have a neighbor within their errors; a list with more than
+# this share was stacked from several.
+_MOST_BY_CHANCE = 0.01
 
 
 def position_columns(names):
@@ -372,13 +375,16 @@ def standardize_sources(table, *, name="sources", origin=None):
         flags = np.clip(np.nan_to_num(flags), 0, 2**31).astype(np.int64)
         out["flags"] = flags if tag is None else _sextractor_flags(flags, column("imaflags_iso"))
     sources = Table({c: v for c, v in out.items() if v is not None})
-    again = _copies(sources)
+    again, stacked = _copies(sources)
     if again.any():
-        warnings.warn(
+        message = (
             f"{name}: {again.sum()} of {len(sources)} rows repeat a source that another row has: "
-            "one row per source is used",
-            WPDCWarning,
+            "one row per source is used"
         )
+        if stacked:
+            warnings.warn(message, WPDCWarning)
+        else:
+            log.info("%s", message)
         sources["x"][again] = sources["y"][again] = np.nan
     return sources
 
@@ -400,11 +406,11 @@ def _position(table, label, name):
 
 
 def _copies(sources):
-    """Mark the further rows of sources that are there several times."""
+    """Mark the further rows of sources; tell whether chance cannot explain them."""
     again = np.zeros(len(sources), bool)
     rows = np.flatnonzero(np.isfinite(sources["x"]) & np.isfinite(sources["y"]))
     if len(rows) < 2:
-        return again
+        return again, False
     part = sources[rows]
     errors = (
         np.hypot(part["x_err"], part["y_err"]) / np.sqrt(2) if "x_err" in sources.colnames else None
@@ -417,7 +423,8 @@ def _copies(sources):
     rank = np.zeros(len(rows)) if errors is None else np.nan_to_num(errors, nan=np.inf)
     order = np.lexsort((rows, rank, star))
     again[rows[order[1:]]] = star[order][1:] == star[order][:-1]
-    return again
+    in_place = len(np.unique(points, axis=0)) < len(points)
+    return again, in_place or again.sum() > _MOST_BY_CHANCE * len(rows)
 
 
 def _sextractor_flags(flags, external):
