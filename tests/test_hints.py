@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from astropy.io import fits
 from astropy.table import Table
 
 import wpdc_gwcs
 from wpdc_gwcs.cli import hints
-from wpdc_gwcs.cli.app import run
-from wpdc_gwcs.cli.hints import hint_of, hint_of_frame
+from wpdc_gwcs.cli.app import app, run
+from wpdc_gwcs.cli.hints import hint_of, hint_of_frame, similar_option
 from wpdc_gwcs.exceptions import DetectionError, FitError, InternalError, MatchError
 
 
@@ -129,3 +130,32 @@ def test_no_picture_is_suggested_where_none_can_be_drawn(monkeypatch):
 def test_of_a_cluster_without_workers():
     error = "--scheduler tcp://a:8786: must have a worker within 60 s, has none"
     assert hint_of(error) == "dask worker tcp://a:8786, on machines that see the files"
+
+
+@pytest.mark.parametrize(
+    ("command", "typed", "meant"),
+    [
+        ("calibrate", "--plots", "--report"),
+        ("monitor", "--figures", "--plots"),
+        ("show", "--plot", "--output"),
+        ("calibrate", "-o", "--output"),
+        ("calibrate", "--catlog", "--catalog"),
+        ("calibrate", "--clobber", "--overwrite"),
+        ("calibrate", "--scale", "--pixel-scale"),
+        ("calibrate", "--dry-run", None),
+    ],
+)
+def test_of_options_of_other_names(capsys, command, typed, meant):
+    assert run([command, typed, "3"]) == 2
+    line = error_of(capsys)
+    assert f"No such option: {typed}" in line
+    assert (f"Did you mean {meant}?" in line) if meant else ("Did you mean" not in line)
+
+
+def test_every_option_that_is_suggested_is_there():
+    group = typer.main.get_command(app)
+    commands = [*group.commands.values(), *group.commands["catalog"].commands.values()]
+    options = {o for command in commands for p in command.params for o in p.opts}
+    for ours in hints._OTHER_NAMES:
+        assert set(ours.split()) <= options
+    assert similar_option("--", ["--output"]) is None

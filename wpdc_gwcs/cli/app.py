@@ -19,7 +19,7 @@ from typing import Annotated
 import typer
 from typer.core import TyperGroup
 
-from wpdc_gwcs.cli.hints import hint_of
+from wpdc_gwcs.cli.hints import hint_of, similar_option
 from wpdc_gwcs.exceptions import FrameFailure, InputError, WPDCError, WPDCWarning
 
 __all__ = ["app", "main", "set_verbosity"]
@@ -208,6 +208,10 @@ def _usage(err):
         print(message)
         return 2
     command = context.command_path if context is not None else "wpdc"
+    if context is not None and type(err).__name__ == "NoSuchOption":
+        options = [option for parameter in context.command.params for option in parameter.opts]
+        meant = similar_option(err.option_name, options)
+        message = err.message + (f". Did you mean {meant}?" if meant else "")
     return _fail(f"{message} (see '{command} --help')", 2)
 
 

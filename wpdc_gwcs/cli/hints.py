@@ -13,7 +13,30 @@ from pathlib import Path
 from wpdc_gwcs.exceptions import InternalError
 from wpdc_gwcs.extras import PLOT, missing
 
-__all__ = ["hint_of", "hint_of_frame"]
+__all__ = ["hint_of", "hint_of_frame", "similar_option"]
+
+# Names of options in other programs, and ours; the first that the command has is suggested.
+_OTHER_NAMES = {
+    "--report --plots --output": "plot plots figure figures image images picture pictures png pdf",
+    "--output": "o out outdir output-dir outfile out-file dest dir d",
+    "--overwrite": "f force clobber replace",
+    "--jobs": "j n np nproc ncores cores cpus threads processes workers parallel",
+    "--catalog": "c cat ref refcat reference reference-catalog astref gaia stars",
+    "--wcs": "h w header head ahead",
+    "--pixel-scale": "scale pixscale",
+    "--max-mag": "mag mag-limit mag-max maglim limit",
+    "--min-snr": "snr sn",
+    "--threshold": "sigma detect-thresh thresh",
+    "--epoch": "date mjd time obs-date",
+    "--degree": "deg order polynomial distort-degrees",
+    "--weight-map": "weights wht",
+    "--config": "config-file settings params",
+    "--detector": "chip ccd",
+    "--solution": "distortion model camera prior",
+    "--resume": "continue restart",
+    "--saturation": "satur satur-level",
+    "--refine": "fit",
+}
 
 # Messages of errors that end a command, and hints; "{path}" is the path that begins the message.
 _OF_COMMANDS = (
@@ -164,6 +187,31 @@ def hint_of_frame(error, source, *, catalog, wcs=None):
     if isinstance(error, OSError):
         return None
     return hint_of(str(error)) or _EXPLAIN.format(**parts)
+
+
+def similar_option(name, options):
+    """Return the option that was probably meant.
+
+    Parameters
+    ----------
+    name : str
+        What was typed, such as ``--plots`` or ``-o``.
+    options : list of str
+        Options of the command.
+
+    Returns
+    -------
+    str or None
+        One of `options`; None if none is similar.
+    """
+    word = name.lstrip("-").lower().replace("_", "-")
+    ours = (option for option, names in _OTHER_NAMES.items() if word in names.split())
+    for option in next(ours, "").split():
+        if option in options:
+            return option
+    long = [option for option in options if option.startswith("--")]
+    begin = [option for option in long if len(word) > 1 and option.startswith(f"--{word}")]
+    return next(iter(begin or difflib.get_close_matches(f"--{word}", long, n=1, cutoff=0.7)), None)
 
 
 def _similar(path):
