@@ -261,6 +261,8 @@ class TestPaths:
     def test_paths_stay_as_they_are(self, folder):
         given = ["b.fits", "b.fits[SCI]", "nothing.fits", "f[1].fits", "b.fits[1][0]"]
         assert expand_paths(given) == given
+        assert expand_paths(["gaia.fits", "b.fits"], without=["./gaia.fits"]) == ["b.fits"]
+        assert expand_paths(["gaia.fits"], without=["gaia.fits"]) == ["gaia.fits"]
 
     def test_folders(self, folder):
         expected = ["./a.fits.fz", "./b.fits", "./c.cat", "./f[1].fits"]

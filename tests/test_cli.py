@@ -320,6 +320,34 @@ def test_export(results, tmp_path, capsys, form):
     assert capsys.readouterr().out == ""
 
 
+def test_export_of_several_files_into_a_folder(results, tmp_path, capsys):
+    folder = tmp_path / "made" / "heads"
+    assert run(["export", str(results), "--format", "head", "--output", str(folder)]) == 0
+    names = sorted(p.name.replace(".wcs.asdf", ".head") for p in results.glob("*.wcs.asdf"))
+    assert sorted(p.name for p in folder.iterdir()) == names
+    assert len(capsys.readouterr().out.splitlines()) == len(names) > 1
+    one = results / "sim-01.wcs.asdf"
+    alone = tmp_path / "alone.head"
+    assert run(["export", str(one), "--format", "head", "--output", str(alone), "-q"]) == 0
+    assert alone.read_bytes() == (folder / "sim-01.head").read_bytes()
+    assert run(["export", str(one), "--format", "sip", "--output", str(folder), "-q"]) == 0
+    assert (folder / "sim-01.sip.fits").exists()
+    (tmp_path / "empty").mkdir()
+    again = tmp_path / "sim-01.wcs.asdf"
+    again.write_bytes(one.read_bytes())
+    capsys.readouterr()
+    for given, output, message in (
+        ([results], folder, "sim-01.head: file exists, and is replaced only with --overwrite"),
+        ([results], alone, f"--output must be a folder for {len(names)} files, "),
+        ([one, again], folder, f"{one} and {again} would both write"),
+        ([tmp_path / "empty"], folder, "the folder has no *.wcs.asdf file; try: the output folder"),
+    ):
+        assert run(["export", *map(str, given), "--format", "head", "--output", str(output)]) == 2
+        assert message in error_of(capsys)
+    assert run(["export", str(results), "--into", "a.fits"]) == 2
+    assert f"--into takes one FILE, got {len(names)}" in error_of(capsys)
+
+
 def test_matches_have_the_sky_with_errors(results):
     """Positions of the sources scatter about the reference stars as their errors say."""
     for name in ("sim-01", "sim-02"):
@@ -359,7 +387,7 @@ def test_export_into_an_image(results, tmp_path, capsys):
         assert run([*command, *wrong]) == 2
         assert message in error_of(capsys)
     assert run(["export", str(file), "--format", "sip"]) == 2
-    assert "needs --output FILE, or --into IMAGE" in error_of(capsys)
+    assert "needs --output FILE or DIR, or --into IMAGE" in error_of(capsys)
 
 
 def test_evaluate_prints_and_writes(results, tmp_path, capsys):

@@ -113,7 +113,7 @@ def measure_sources(frame, settings=None):
     sources = detected
     if settings.centroids == "psf":
         announce("PSF")
-        epsf = measure_psf(background, detected, gain=gain)
+        epsf = measure_psf(background, detected, gain=gain, name=frame.source)
         if epsf is not None:
             noise = measure_noise(background, detected, epsf)
             wrong = settings.gain is None and _contradicts(gain, noise)
@@ -127,7 +127,7 @@ def measure_sources(frame, settings=None):
                 gain = measured if measured > 0 else None
                 detected = detect_sources(background, gain=gain, **options)
                 if wrong:
-                    epsf = measure_psf(background, detected, gain=gain)
+                    epsf = measure_psf(background, detected, gain=gain, name=frame.source)
             detected, sources = _fit_psf(background, detected, epsf, gain, settings.threshold)
             sources.meta.update(
                 gain=noise.gain if gain is None else gain,

@@ -100,13 +100,17 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
     return None if profile is None else to_photutils(profile)
 
 
-def measure_psf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0, vary="auto"):
+def measure_psf(
+    data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0, vary="auto", name=None
+):
     """Effective PSF of a frame, as `build_epsf`, without photutils.
 
     Parameters
     ----------
     data, sources, gain, error, n_max, min_snr, vary
         As for `build_epsf`.
+    name : str, optional
+        Name of the frame, for the warning.
 
     Returns
     -------
@@ -130,8 +134,9 @@ def measure_psf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0
         profile = learn_psf(field, stars.take(rows), fwhm, _per_unit(gain, unit), vary)
         if profile is not None:
             return profile
+    where = "" if name is None else f"{name}: "
     warnings.warn(
-        f"no effective PSF: {len(rows)} bright, clean, isolated stars, {MIN_STARS} needed; "
+        f"{where}no effective PSF: {len(rows)} bright, clean, isolated stars, {MIN_STARS} needed; "
         "positions are windowed centroids",
         CentroidWarning,
     )

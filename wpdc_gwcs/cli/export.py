@@ -7,7 +7,7 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.completion import one_of
-from wpdc_gwcs.cli.files import CalibrationFile, read_one
+from wpdc_gwcs.cli.files import read_one, wcs_files
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
@@ -17,6 +17,8 @@ from wpdc_gwcs.exceptions import InputError
 _AS_GOOD = 1.1
 _TOLD_PX = 1e-3
 FORMATS = ("fits", "cpdis", "tpv", "head", "sip", "tab", "stock")
+# Names of files in a folder: STEM.head, STEM.stock.asdf, STEM.sip.fits...
+_SUFFIXES = {"head": ".head", "stock": ".stock.asdf"}
 
 Degree = Annotated[
     int | None,
@@ -35,7 +37,13 @@ Degree = Annotated[
     epilog="Example: wpdc export results/image.wcs.asdf --format sip --into image.fits",
 )
 def export_command(
-    file: CalibrationFile,
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="*.wcs.asdf, *.solution.asdf or exported FITS files; folders of *.wcs.asdf.",
+        ),
+    ],
     format: Annotated[
         str | None,
         typer.Option(
@@ -48,7 +56,12 @@ def export_command(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", metavar="OUT", help="File to write; with --into, a copy."),
+        typer.Option(
+            "--output",
+            metavar="OUT",
+            help="File to write, or a folder for STEM.head, STEM.sip.fits and so on (made if "
+            "needed for several FILEs); with --into, a copy.",
+        ),
     ] = None,
     into: Annotated[
         str | None,
@@ -79,22 +92,51 @@ def export_command(
     if format not in FORMATS:
         raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {format!r}")
     if into is None and output is None:
-        raise InputError("export needs --output FILE, or --into IMAGE")
+        raise InputError("export needs --output FILE or DIR, or --into IMAGE")
     if alternates not in ("keep", "remove"):
         raise InputError(f"--alternates must be keep or remove, got {alternates!r}")
-    if output is not None:
-        require_free(output, overwrite)
-    calibration = read_one(file)
-    try:
-        if into is not None:
-            where, note = _into(calibration, into, format, degree, output, alternates, overwrite)
-        else:
-            where = output
-            note = write_as(calibration, output, format, degree=degree, overwrite=overwrite)
-    except ValueError as err:
-        raise InputError(str(err)) from err
-    if not quiet:
-        typer.echo(f"{where}: written as {format}{note}")
+    found = wcs_files(files)
+    if into is not None:
+        if len(found) > 1:
+            raise InputError(f"--into takes one FILE, got {len(found)}")
+        places = {found[0]: output}
+    else:
+        places = _places(found, output, format, in_folder=found != files or len(files) > 1)
+    for place in places.values():
+        if place is not None:
+            require_free(place, overwrite)
+    for file, place in places.items():
+        calibration = read_one(file)
+        try:
+            if into is not None:
+                where, note = _into(calibration, into, format, degree, place, alternates, overwrite)
+            else:
+                where = place
+                note = write_as(calibration, place, format, degree=degree, overwrite=overwrite)
+        except ValueError as err:
+            raise InputError(str(err)) from err
+        if not quiet:
+            typer.echo(f"{where}: written as {format}{note}")
+
+
+def _places(files, output, format, *, in_folder):
+    """File to write for each file; a folder that is needed is made."""
+    if not in_folder and not output.is_dir():
+        return {files[0]: output}
+    from wpdc_gwcs.io.files import stem_of
+
+    suffix = _SUFFIXES.get(format, f".{format}.fits")
+    places = {file: output / (stem_of(file).removesuffix(".wcs") + suffix) for file in files}
+    origins = {}
+    for file, place in places.items():
+        if (other := origins.setdefault(place, file)) != file:
+            raise InputError(f"{other} and {file} would both write {place}")
+    if output.exists() and not output.is_dir():
+        raise InputError(
+            f"--output must be a folder for {counted(len(files), 'file')}, {output} is a file"
+        )
+    output.mkdir(parents=True, exist_ok=True)
+    return places
 
 
 def _into(calibration, image, format, degree, output, alternates, overwrite):

@@ -190,3 +190,27 @@ def match_files(paths):
             raise InputError(f"{path}: no such file")
         found.append(path)
     return found
+
+
+def wcs_files(paths):
+    """List the WCS files of files and folders, in order.
+
+    Parameters
+    ----------
+    paths : list of Path
+        Files, or folders with ``*.wcs.asdf`` files.
+
+    Returns
+    -------
+    list of Path
+        The files, each once.
+    """
+    found = []
+    for path in paths:
+        inside = [path]
+        if path.is_dir():
+            inside = sorted(path.glob("*.wcs.asdf"))
+            if not inside:
+                raise InputError(f"{path}: the folder has no *.wcs.asdf file")
+        found += inside
+    return list(dict.fromkeys(found))

@@ -42,7 +42,7 @@ _OTHER_NAMES = {
 _OF_COMMANDS = (
     (
         r".*summary\.ecsv: must be a readable file: No such file"
-        r"|.*the folder has no \*\.matches\.ecsv",
+        r"|.*the folder has no \*\.(?:matches\.ecsv|wcs\.asdf)",
         "the output folder of wpdc calibrate",
     ),
     (

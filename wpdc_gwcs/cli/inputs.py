@@ -22,7 +22,8 @@ def expand_paths(given, *, without=()):
         Paths, also ``path[EXT]``; folders, which stand for their FITS files and FITS_LDAC lists;
         patterns with ``*`` and ``?``; ``@FILE``, a text file with one of these per line.
     without : iterable of str, optional
-        Files in a folder that are not frames, such as the catalog.
+        Files that are not frames, such as the catalog: left out of folders and patterns, also of
+        those that the shell has expanded.
 
     Returns
     -------
@@ -35,7 +36,10 @@ def expand_paths(given, *, without=()):
         If a list cannot be read, or a folder, a pattern or a list yields no files.
     """
     others = {os.path.realpath(path) for path in without}
-    return [path for one in given for path in _expand(str(one), others)]
+    found = [path for one in given for path in _expand(str(one), others)]
+    # A catalog alone is a mistake, about which its reader has more to say.
+    frames = [path for path in found if os.path.realpath(path) not in others]
+    return frames or found
 
 
 def _expand(one, others):
