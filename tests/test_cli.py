@@ -172,7 +172,10 @@ def make_bad_files(folder, reference):
         (["{frame}", "--threshold", "inf"], "threshold and min_snr must be finite, got inf"),
         (["{frame}", "--scheduler-timeout", "nan"], "--scheduler-timeout must be positive"),
         (["{frame}", "--degree", "²"], "invalid literal"),
-        (["{frame}", "--output", "/dev/null"], "/dev/null: the output folder must be writable"),
+        (
+            ["{frame}", "--output", "/dev/null"],
+            "/dev/null: the output folder must be a folder",
+        ),
         (["{frame}", "--jobs", "0"], "--jobs must be at least 1, got 0"),
         (["{frame}", "--update"], "--update needs the stored solution"),
         (["{frame}", "--method", "scamp"], "method must be one of wpdc, paper, got 'scamp'"),
@@ -338,7 +341,7 @@ def test_export_of_several_files_into_a_folder(results, tmp_path, capsys):
     capsys.readouterr()
     for given, output, message in (
         ([results], folder, "sim-01.head: file exists, and is replaced only with --overwrite"),
-        ([results], alone, f"--output must be a folder for {len(names)} files, "),
+        ([results], alone, f"{alone}: the output folder must be a folder, is a file"),
         ([one, again], folder, f"{one} and {again} would both write"),
         ([tmp_path / "empty"], folder, "the folder has no *.wcs.asdf file; try: the output folder"),
     ):

@@ -16,6 +16,7 @@ from wpdc_gwcs.io.files import (
     check_complete,
     check_output,
     file_kind,
+    make_folder,
     open_fits,
     stem_of,
 )
@@ -176,6 +177,19 @@ def test_folder_that_cannot_be_written_to(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with pytest.raises(InputError, match="folder must be writable"):
         check_output(tmp_path / "a.txt", overwrite=False)
+
+
+def test_make_folder(tmp_path):
+    make_folder(tmp_path / "a" / "b")
+    make_folder(tmp_path / "a" / "b")
+    assert (tmp_path / "a" / "b").is_dir()
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file: the output folder must be a folder, is a file"):
+        make_folder(tmp_path / "file")
+    with pytest.raises(InputError, match="the output folder must be writable"):
+        make_folder(tmp_path / "file" / "inside")
+    with pytest.raises(InputError, match="the output folder must be writable: .*null"):
+        make_folder("a\0b")
 
 
 def test_disk_errors_name_the_file(tmp_path):

@@ -310,6 +310,14 @@ def test_blind_finds_turned_frames(name):
     assert np.median(np.hypot(x - field["xr"][j], y - field["yr"][j])) < 0.2
 
 
+def test_a_wider_search_is_suggested_only_where_it_can_help():
+    field = turn(make_field(17, scale=1.0), np.eye(2) * 0.8)
+    for blind in (False, True):
+        with pytest.raises(MatchError, match=r"the pairs have 0\.(799|80)\d* times its scale") as caught:
+            run(field, blind=blind)
+        assert "blind" not in str(caught.value)
+
+
 @pytest.mark.parametrize("scale", [0.95, 1.05])
 def test_blind_finds_wrong_scale(scale):
     field = turn(make_field(17, scale=1.0), np.eye(2) * scale)

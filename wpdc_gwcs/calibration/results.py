@@ -95,14 +95,15 @@ class ResultFolder:
         self._lock = None
 
     def __enter__(self):
+        from wpdc_gwcs.io.files import make_folder
+
+        make_folder(self.folder)
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.folder):
                 pass
-        except (OSError, ValueError) as err:
-            reason = getattr(err, "strerror", None) or err
+        except OSError as err:
             raise InputError(
-                f"{self.folder}: the output folder must be writable: {reason}"
+                f"{self.folder}: the output folder must be writable: {err.strerror or err}"
             ) from err
         self._lock = lock(self.folder)
         try:

@@ -79,8 +79,9 @@ def draw_demo(exposure, calibration, error, folder):
         Folder for the pictures.
     """
     from wpdc_gwcs import plotting
+    from wpdc_gwcs.io.files import make_folder
 
-    folder.mkdir(exist_ok=True)
+    make_folder(folder)
     shape = exposure.image_shape
     table = calibration.solution.lookup_table
     figures = {

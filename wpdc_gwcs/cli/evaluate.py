@@ -359,6 +359,7 @@ def _table_of_weights(compared):
 def _write_plots(frames, compared, folder, *, overwrite):
     from wpdc_gwcs import plotting
     from wpdc_gwcs.calibration.names import file_stem
+    from wpdc_gwcs.io.files import make_folder
 
     figures = {}
     for frame in frames:
@@ -373,12 +374,7 @@ def _write_plots(frames, compared, folder, *, overwrite):
             )
     for detector, results in compared.items():
         figures[f"{file_stem(detector)}.weights.png"] = partial(plotting.plot_weights, results)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as err:
-        raise InputError(
-            f"{folder}: the folder of --plots must be writable: {err.strerror}"
-        ) from err
+    make_folder(folder)
     for name in figures:
         require_free(folder / name, overwrite)
     for name, plot in figures.items():

@@ -123,7 +123,7 @@ def _places(files, output, format, *, in_folder):
     """File to write for each file; a folder that is needed is made."""
     if not in_folder and not output.is_dir():
         return {files[0]: output}
-    from wpdc_gwcs.io.files import stem_of
+    from wpdc_gwcs.io.files import make_folder, stem_of
 
     suffix = _SUFFIXES.get(format, f".{format}.fits")
     places = {file: output / (stem_of(file).removesuffix(".wcs") + suffix) for file in files}
@@ -131,11 +131,7 @@ def _places(files, output, format, *, in_folder):
     for file, place in places.items():
         if (other := origins.setdefault(place, file)) != file:
             raise InputError(f"{other} and {file} would both write {place}")
-    if output.exists() and not output.is_dir():
-        raise InputError(
-            f"--output must be a folder for {counted(len(files), 'file')}, {output} is a file"
-        )
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     return places
 
 

@@ -304,9 +304,10 @@ def _stacked(tables):
 
 def _draw(history, files):
     from wpdc_gwcs import plotting
+    from wpdc_gwcs.io.files import make_folder
 
+    make_folder(files[0].parent)
     try:
-        files[0].parent.mkdir(parents=True, exist_ok=True)
         for plot, file in zip(
             (plotting.plot_drift_history, plotting.plot_cell_history), files, strict=True
         ):

@@ -24,6 +24,7 @@ __all__ = [
     "check_output",
     "file_kind",
     "first_line",
+    "make_folder",
     "open_fits",
     "open_stream",
     "place",
@@ -405,6 +406,29 @@ def check_output(path, *, overwrite):
         raise InputError(f"{path}: the output folder must exist, found no {path.parent}")
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{path}: the output folder must be writable, {path.parent} is not")
+
+
+def make_folder(path):
+    """Make the folder that files are written to, unless it is there.
+
+    Parameters
+    ----------
+    path : path-like
+        The folder; those above it are made as well.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made, or is a file.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as problem:
+        raise InputError(f"{path}: the output folder must be a folder, is a file") from problem
+    except (OSError, ValueError) as problem:
+        reason = getattr(problem, "strerror", None) or problem
+        raise InputError(f"{path}: the output folder must be writable: {reason}") from problem
 
 
 def place(temporary, path, *, overwrite):

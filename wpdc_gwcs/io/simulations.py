@@ -15,8 +15,7 @@ from astropy import units as u
 from astropy.io import fits
 from astropy.table import Table
 
-from wpdc_gwcs.exceptions import InputError
-from wpdc_gwcs.io.files import OutputExistsError, atomic_path
+from wpdc_gwcs.io.files import OutputExistsError, atomic_path, make_folder
 from wpdc_gwcs.io.ldac import write_ldac
 from wpdc_gwcs.io.tables import read_table, write_table
 from wpdc_gwcs.io.truth import read_truths, write_truths
@@ -157,10 +156,7 @@ def write_simulation(
     for path in [catalog, truth, *frames, *tables, *(h for h in headers if h is not None)]:
         if path.exists() and not overwrite:
             raise OutputExistsError(f"{path}: file exists and is kept")
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as problem:
-        raise InputError(f"{directory}: cannot be made: {problem.strerror}") from problem
+    make_folder(directory)
     with atomic_path(catalog, overwrite=overwrite) as temporary:
         simulation.reference.write(temporary, format="fits")
     for k, exposure in enumerate(simulation.exposures):

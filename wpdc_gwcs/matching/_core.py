@@ -168,7 +168,7 @@ def _search(problem, clock):
         found, attempts, seen = _follow(problem, seeds, attempts, seen, clock)
         if found is not None:
             return found
-    raise refusal(problem, attempts, hint=not problem.options.blind)
+    raise refusal(problem, attempts)
 
 
 def _follow(problem, seeds, attempts, seen, clock):

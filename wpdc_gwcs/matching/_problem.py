@@ -10,7 +10,15 @@ from wpdc_gwcs.matching._mapping import SmoothMap
 from wpdc_gwcs.matching._options import MatchOptions
 from wpdc_gwcs.matching._pairs import find_nearest
 
-__all__ = ["MAX_CROWDING", "MIN_STARS", "Limits", "Problem", "Stars", "prepare_problem"]
+__all__ = [
+    "BLIND_SCALE",
+    "MAX_CROWDING",
+    "MIN_STARS",
+    "Limits",
+    "Problem",
+    "Stars",
+    "prepare_problem",
+]
 
 # Fewer stars than this in either list cannot be evidence.
 MIN_STARS = 8
@@ -23,7 +31,7 @@ _MAX_DISTORTION_SHARE = 0.12
 # Error of the pointing that is searched for: px, and share of the longer side; in a blind search.
 _MAX_SHIFT, _MAX_SHIFT_SHARE, _BLIND_SHIFT_SHARE = 450.0, 0.15, 0.3
 # Minimum scale error allowed in a blind search: some headers have the scale of another binning.
-_BLIND_SCALE = 0.06
+BLIND_SCALE = 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +154,7 @@ def _limits_of(options, shape):
     max_shift, max_scale = options.max_shift, options.max_scale
     if options.blind:
         max_shift = max(_BLIND_SHIFT_SHARE * longer, max_shift or 0.0)
-        max_scale = max(_BLIND_SCALE, max_scale)
+        max_scale = max(BLIND_SCALE, max_scale)
     elif max_shift is None:
         max_shift = max(_MAX_SHIFT, _MAX_SHIFT_SHARE * longer)
     max_distortion = options.max_distortion

@@ -20,7 +20,7 @@ from wpdc_gwcs.matching._growth import (
 )
 from wpdc_gwcs.matching._mapping import SmoothMap, fit_smooth_map, turn_and_scale
 from wpdc_gwcs.matching._pairs import find_edges, one_to_one
-from wpdc_gwcs.matching._problem import MIN_STARS
+from wpdc_gwcs.matching._problem import BLIND_SCALE, MIN_STARS
 from wpdc_gwcs.matching._rivals import find_rival_offset
 
 __all__ = [
@@ -244,7 +244,7 @@ def header_error(problem, match):
         # on a narrow frame a mirror is within reach of the other limits
         return MatchError(
             f"the starting WCS is mirrored or stretched: the pairs change the area of the "
-            f"frame by a factor of {area:.3g}; {_HINT}"
+            f"frame by a factor of {area:.3g}{_hint(problem)}"
         )
     turned, scaled = zip(
         *(turn_and_scale(matrix, problem.shape) for matrix in (at_center, of_pairs)), strict=True
@@ -256,9 +256,12 @@ def header_error(problem, match):
         ("scale", 100 * min(np.abs(np.subtract(scaled, 1))), 100 * limits.max_scale, "%"),
     ):
         if value > most:
+            hint = _hint(problem)
+            if what == "scale" and value > 100 * BLIND_SCALE:
+                hint = f"; the pairs have {scaled[1]:.4g} times its scale"
             return MatchError(
                 f"the {what} of the starting WCS is off by {value:.4g} {unit}, "
-                f"at most {most:.4g} {unit} is allowed; {_HINT}",
+                f"at most {most:.4g} {unit} is allowed{hint}",
                 found={
                     "shift": tuple(map(float, shift)),
                     "rotation": float(turned[1]),
@@ -268,7 +271,12 @@ def header_error(problem, match):
     return None
 
 
-def refusal(problem, attempts, *, hint):
+def _hint(problem):
+    """Suggest a wider search where that has not been tried."""
+    return "" if problem.options.blind else f"; {_HINT}"
+
+
+def refusal(problem, attempts, *, hint=True):
     """Build the error that says what was missing."""
     n_sources, n_reference = len(problem.sources), len(problem.stars.points)
     if attempts.best is None:
@@ -281,7 +289,7 @@ def refusal(problem, attempts, *, hint):
     return MatchError(
         f"no match with sufficient evidence ({counted(n_sources, 'source')}, "
         f"{counted(n_reference, 'reference star')} in reach): {reason}"
-        + (f"; {_HINT}" if hint else "")
+        + (_hint(problem) if hint else "")
     )
 
 

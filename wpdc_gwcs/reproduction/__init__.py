@@ -6,6 +6,7 @@ from astropy.table import vstack
 
 from wpdc_gwcs.exceptions import InputError
 from wpdc_gwcs.io import write_table
+from wpdc_gwcs.io.files import make_folder
 from wpdc_gwcs.reproduction.bass import reproduce_bass
 from wpdc_gwcs.reproduction.centroids import reproduce_centroids
 from wpdc_gwcs.reproduction.claims import CLAIMS, Claim
@@ -82,10 +83,7 @@ def reproduce(parts, folder, *, scale=FULL, seed=SEED, jobs=1, overwrite=False, 
         raise InputError(f"{target}: file exists, and is replaced only with --overwrite")
     tables = []
     for part in parts:
-        try:
-            (folder / part).mkdir(parents=True, exist_ok=True)
-        except OSError as problem:
-            raise InputError(f"{folder / part}: cannot be made: {problem.strerror}") from problem
+        make_folder(folder / part)
         tables.append(PARTS[part](folder / part, scale, seed=seed, jobs=jobs, progress=progress))
         # After every part: they take minutes each.
         results = vstack(tables)
