@@ -313,7 +313,9 @@ def test_blind_finds_turned_frames(name):
 def test_a_wider_search_is_suggested_only_where_it_can_help():
     field = turn(make_field(17, scale=1.0), np.eye(2) * 0.8)
     for blind in (False, True):
-        with pytest.raises(MatchError, match=r"the pairs have 0\.(799|80)\d* times its scale") as caught:
+        with pytest.raises(
+            MatchError, match=r"pairs have 0\.(799|80)\d* times its scale"
+        ) as caught:
             run(field, blind=blind)
         assert "blind" not in str(caught.value)
 

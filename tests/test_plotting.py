@@ -278,9 +278,9 @@ def test_focal_plane_of_a_camera_is_the_same():
 
 def test_focal_plane_wants_every_detector_once():
     frames = detectors()
-    with pytest.raises(ValueError, match="'a-1' is there twice"):
+    with pytest.raises(ValueError, match="got 'a-1' twice"):
         plotting.plot_focal_plane([*frames, frames[0]])
-    with pytest.raises(ValueError, match="one detector at least"):
+    with pytest.raises(ValueError, match="at least one detector"):
         plotting.plot_focal_plane([])
     with pytest.raises(ValueError, match="n_arrows must be at least 1, got 0"):
         plotting.plot_focal_plane(frames, n_arrows=0)
@@ -305,7 +305,7 @@ def test_slices_are_means_and_middle_two_thirds(rng, saved):
     no_labels_overlap(figure)
     with pytest.raises(ValueError, match="width must be positive px, got 0"):
         plotting.plot_slices({"flat": table}, image_shape=SHAPE, width=0)
-    with pytest.raises(ValueError, match="one solution at least"):
+    with pytest.raises(ValueError, match="at least one solution"):
         plotting.plot_slices({}, image_shape=SHAPE)
 
 

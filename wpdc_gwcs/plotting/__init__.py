@@ -22,7 +22,7 @@ of a detector or a camera      shows
 =============================  =====================================================================
 `plot_focal_plane`             the distortion of all detectors in the focal plane
 `plot_before_after`            residuals before and after the calibration, with their profiles
-`plot_slices`                  mean residuals in slices of the detector, several solutions together
+`plot_slices`                  mean residuals in slices of the detector, for several solutions
 `plot_weights`                 distributions with each of the radial weights
 `plot_magnitude`               residuals against magnitude, pooled
 `plot_centroids`               centroid errors against magnitude, and the photon limit

@@ -1,4 +1,4 @@
-"""What all figures have in common: colors, sizes, limits, columns."""
+"""Parts that all figures share: colors, sizes, limits, columns."""
 
 import numpy as np
 from astropy.stats import SigmaClip
@@ -30,7 +30,7 @@ __all__ = [
     "symmetric_limit",
 ]
 
-#: Okabe and Ito's colors, told apart with any color vision.
+#: The colors of Okabe and Ito, which are distinct for every kind of color vision.
 BLUE, ORANGE, GREEN, GREY, BLACK = "#0072B2", "#D55E00", "#009E73", "#999999", "#000000"
 OTHERS = (GREEN, "#CC79A7", BLACK)
 DIVERGING, SEQUENTIAL = "RdBu_r", "viridis"
@@ -43,7 +43,7 @@ def new_figure(width, height):
 
 
 def given_axes(axes, n, width, height, **options):
-    """Give ``n`` axes: those given, or new ones beside each other."""
+    """Return the ``n`` given axes, or new ones side by side."""
     if axes is None:
         return new_figure(width, height).subplots(1, n, squeeze=False, **options)[0]
     axes = np.ravel(axes)
@@ -53,7 +53,7 @@ def given_axes(axes, n, width, height, **options):
 
 
 def pool(matches):
-    """Positions and residuals of the stars of one or several tables, those of no use left out."""
+    """Positions and residuals of the usable stars of one or several tables."""
     tables = as_tables(matches)
     columns = [np.array(get_columns(t))[:, np.any(get_flags(t), axis=0)] for t in tables]
     return np.concatenate(columns, axis=1)
@@ -99,7 +99,7 @@ def get_columns(matches):
 
 
 def get_flags(matches):
-    """Which matches the fit used and which were held out; all used where the table says nothing."""
+    """Masks of the matches that were used and held out; without such columns, all were used."""
     n = len(matches)
     given = matches.colnames
     holdout = np.asarray(matches["holdout"], bool) if "holdout" in given else np.zeros(n, bool)
@@ -115,7 +115,7 @@ def running_percentiles(position, values, *, n_bins=25):
     """Median and middle 68 % of values in equally filled bins of position, at the bins' medians."""
     finite = np.isfinite(position) & np.isfinite(values)
     position, values = position[finite], values[finite]
-    # A bin of fewer than 10 stars would draw noise.
+    # Bins of fewer than 10 stars would show noise.
     n_bins = max(1, min(n_bins, len(position) // 10))
     if not len(position):
         return np.empty((4, 0))
@@ -126,7 +126,7 @@ def running_percentiles(position, values, *, n_bins=25):
 
 
 def symmetric_limit(*residuals):
-    """Limit of an axis that shows residuals: five times their scatter, about zero."""
+    """Limit of an axis that shows residuals: their mean plus five times their scatter."""
     stats = evaluate(*residuals)
     limit = max(abs(stats.mean_dx), abs(stats.mean_dy))
     limit += 5 * max(stats.scatter_dx, stats.scatter_dy)
@@ -138,7 +138,7 @@ def marker_size(n):
 
 
 def round_number(value):
-    """Nearest of 1, 2, 5 times a power of ten."""
+    """Round to the nearest of 1, 2 or 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
     steps = np.array([1.0, 2.0, 5.0, 10.0])
     return float(steps[np.argmin(np.abs(np.log(value / power / steps)))] * power)

@@ -12,7 +12,7 @@ __all__ = ["Arrows", "draw_arrows"]
 
 @dataclass(frozen=True, eq=False)
 class Arrows:
-    """Arrows that were drawn, and what they show.
+    """Arrows on a figure, and their scale.
 
     Parameters
     ----------
@@ -32,14 +32,14 @@ class Arrows:
     rms: float
 
     def draw_key(self, axes, x, y, *, labelpos="E"):
-        """Draw an arrow of a round length, and what it stands for.
+        """Draw a key: an arrow of a round length, with its value.
 
         Parameters
         ----------
         axes : `matplotlib.axes.Axes`
-            Where the arrows are.
+            Axes that have the arrows.
         x, y : float
-            Place in units of the axes.
+            Position in units of the axes.
         labelpos : {'N', 'S', 'E', 'W'}, optional
             Side of the label.
         """
@@ -56,9 +56,9 @@ def draw_arrows(axes, x, y, dx, dy, *, image_shape, n_bins):
     Parameters
     ----------
     axes : `matplotlib.axes.Axes`
-        Where they go.
+        Axes to draw into.
     x, y, dx, dy : (N,) array_like
-        Pixels, zero based, and residuals, px.
+        Pixel coordinates, zero based, and residuals, px.
     image_shape : (int, int)
         Shape of the detector, ``(ny, nx)``.
     n_bins : int
@@ -67,7 +67,7 @@ def draw_arrows(axes, x, y, dx, dy, *, image_shape, n_bins):
     Returns
     -------
     Arrows
-        One for each cell that has stars.
+        One arrow for each cell that has stars.
     """
     ny, nx = image_shape
     u, v, count = binned_residuals(x, y, dx, dy, image_shape=image_shape, n_bins=n_bins)
@@ -76,8 +76,8 @@ def draw_arrows(axes, x, y, dx, dy, *, image_shape, n_bins):
     iy, ix = np.nonzero(filled)
     u, v = u[filled], v[filled]
     length = np.hypot(u, v)
-    # A typical arrow is as long as a cell, the longest one has room beside the outer cells; the key
-    # is a round number near the typical one.
+    # A typical arrow is as long as a cell, and the longest one fits into the margin.  The key is a
+    # round number near the typical one.
     typical = float(max(np.percentile(length, 80), length.max() / 1.9)) if length.size else 0.0
     typical = typical or 1.0
     quiver = axes.quiver(

@@ -1,4 +1,4 @@
-"""Residuals before and after a calibration: arrows over the detector, and their profiles."""
+"""Residuals before and after a calibration: arrows over the detector, and profiles."""
 
 import numpy as np
 
@@ -35,18 +35,18 @@ def plot_before_after(
     Parameters
     ----------
     before, after : `~astropy.table.Table` or iterable of them
-        Columns ``x``, ``y``, ``dx``, ``dy`` in px, and ``used`` and ``holdout`` if there; tables of
-        several exposures are pooled.  `~wpdc_gwcs.evaluation.uncorrected_residuals` gives those
-        before.
+        Columns ``x``, ``y``, ``dx``, ``dy`` in px, and optionally ``used`` and ``holdout``.  Tables
+        of several exposures are pooled.  `~wpdc_gwcs.evaluation.uncorrected_residuals` returns the
+        residuals before a calibration.
     image_shape : (int, int)
         Shape of the detector, ``(ny, nx)``.
     axes : two `matplotlib.axes.Axes`, optional
-        Their areas are divided between the maps and, above and to the right, their profiles.  New
-        ones if not given.
+        Axes to draw into: each is divided into a map and, above and to the right, its profiles.
+        Default: new ones.
     n_bins : int, optional
         Cells along each side of the detector.
     titles : (str, str), optional
-        Titles of the two.
+        Titles of the two maps.
     n_points : int, optional
         Largest number of stars in the profiles.
     seed : int, optional
@@ -72,7 +72,6 @@ def plot_before_after(
     >>> axes.shape, axes[0, 1].get_ylabel() == axes[0, 3].get_xlabel()
     ((2, 5), True)
     """
-    ny, nx = image_shape
     ny, nx = image_shape
     axes = given_axes(axes, 2, 11.0, 5.0 * min(ny / nx, 1.6) + 0.6)
     panels = zip(axes, (before, after), titles, strict=True)
@@ -104,7 +103,7 @@ def _draw_one(main, x, y, dx, dy, image_shape, n_bins, title, n_points, seed):
         panel.axvline(0, color="black", lw=0.6)
         panel.set_xlim(-limit, limit)
         panel.tick_params(axis="y", labelleft=False)
-        # Above, where there is room between the profiles of both directions.
+        # Ticks and label go above, into the space between the profiles.
         panel.xaxis.tick_top()
         panel.xaxis.set_label_position("top")
         panel.tick_params(axis="x", rotation=90)
@@ -114,7 +113,7 @@ def _draw_one(main, x, y, dx, dy, image_shape, n_bins, title, n_points, seed):
         panel.tick_params(labelsize="small")
         panel.spines[:].set_color(GREY)
         axis = panel.yaxis if panel in above else panel.xaxis
-        # The ends are left free, for the numbers of the neighbor.
+        # No ticks at the ends: their numbers would touch those of the next panel.
         axis.set_major_locator(MaxNLocator(3, symmetric=True, prune="both"))
     for axis in (main.xaxis, main.yaxis):
         axis.set_major_locator(MaxNLocator(5, integer=True))

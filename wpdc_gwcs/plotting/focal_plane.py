@@ -7,7 +7,7 @@ from wpdc_gwcs.plotting._style import BLUE, GREY, ORANGE, given_axes, round_numb
 
 __all__ = ["plot_focal_plane"]
 
-# Length of the longest arrow in units of the distance of the arrows, if no magnification is given.
+# Default length of the longest arrow, as a fraction of the distance between arrows.
 _LONGEST = 2.5
 
 
@@ -17,30 +17,30 @@ def plot_focal_plane(detectors, *, axes=None, n_arrows=8, magnification=None):
     Parameters
     ----------
     detectors : Camera or iterable of Calibration
-        The camera, or one calibrated frame of each detector, all of the same exposure or with the
-        same pointing of the camera.
+        The camera, or one calibrated frame of each detector.  All frames must be of one exposure,
+        or of exposures with the same pointing.
     axes : `matplotlib.axes.Axes`, optional
-        Where it goes; new ones if not given.
+        Axes to draw into.  Default: new ones.
     n_arrows : int, optional
-        Arrows along each side of a detector.
+        Number of arrows along each side of a detector.
     magnification : float, optional
-        Ratio of the length of the arrows to the distortion; 10 in the paper.  By default a round
-        number for which the arrows do not cross.
+        Ratio of the length of the arrows to the distortion; 10 in the paper.  Default: a round
+        number at which the arrows do not cross.
 
     Returns
     -------
     `matplotlib.axes.Axes`
-        With a box and a name for each detector, in thousands of px of the focal plane.
+        Axes in thousands of px of the focal plane, with an outline and a name for each detector.
 
     Raises
     ------
     ValueError
-        If there is no detector, or one is there twice.
+        If there is no detector, a detector occurs twice, or ``n_arrows`` is less than 1.
 
     Notes
     -----
-    An arrow starts at the position of the pixel without distortion, by the linear part of the
-    solution about its reference point, and ends at the position by the whole solution.
+    An arrow starts where the linear part of the solution, about its reference point, puts the
+    pixel.  It ends where the whole solution puts it.
 
     References
     ----------
@@ -103,13 +103,13 @@ def plot_focal_plane(detectors, *, axes=None, n_arrows=8, magnification=None):
 
 
 def _outline(image_shape):
-    """Corners of the outer pixel edges of a detector, the first one twice."""
+    """Outline of a detector along the outer edges of its pixels, closed."""
     ny, nx = image_shape
     return np.array([[0, nx, nx, 0, 0], [0, 0, ny, ny, 0]]) - 0.5
 
 
 def _of_camera(camera):
-    """Name, solution and map from undistorted px to the focal plane of each detector."""
+    """Name and solution of each detector, and its map from undistorted px to the focal plane."""
     found = []
     for k, name in enumerate(camera.detectors):
         solution = camera.solutions[name]
@@ -123,14 +123,14 @@ def _of_camera(camera):
 
 
 def _of_frames(calibrations):
-    """Return the same for frames, in the plane of the first one about the middle of all."""
+    """Return the same for frames, in the plane of the first one, about the center of all."""
     calibrations = list(calibrations)
     if not calibrations:
-        raise ValueError("a focal plane needs one detector at least")
+        raise ValueError("a focal plane needs at least one detector")
     names = [c.solution.detector for c in calibrations]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
-        raise ValueError(f"every detector must be there once, {min(twice)!r} is there twice")
+        raise ValueError(f"every detector must be given once, got {min(twice)!r} twice")
     directions = np.radians([c.crval for c in calibrations])
     ra, dec = directions.T
     x, y, z = np.mean([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
@@ -151,7 +151,7 @@ def _of_frames(calibrations):
 
 
 class _OwnDistortion:
-    """Distortion of a frame with its field, as the solution of a detector has it."""
+    """Distortion of a frame, its field included, in the form of a solution."""
 
     def __init__(self, calibration):
         self.image_shape = calibration.solution.image_shape

@@ -1,4 +1,4 @@
-"""What became of a stored solution over time: residuals, drift, and each cell of the detector."""
+"""History of a stored solution: residuals, drift, and each cell of the detector."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from wpdc_gwcs.plotting._style import BLACK, BLUE, DIVERGING, GREY, ORANGE, new_
 
 __all__ = ["plot_cell_history", "plot_drift_history"]
 
-# Names of cells along each side of the detector.
+# Labels of cells along each side of the detector.
 _MOST_LABELS = 16
 
 
@@ -22,8 +22,20 @@ def plot_drift_history(history):
     Returns
     -------
     `matplotlib.figure.Figure`
-        Three panels over time: mean residuals with their errors, scatter, and the change where
-        there is one; periods that raise an alarm are marked in all of them.
+        Three panels over time: mean residuals with their errors, scatter, and the size of the
+        change.  Periods that raise an alarm are marked in all of them.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import calibrate, simulate
+    >>> from wpdc_gwcs.evaluation import track_drift
+    >>> from wpdc_gwcs.plotting import plot_drift_history
+    >>> sky = simulate(2, image_shape=(1000, 1000), density=30, distortion=10, seed=2)
+    >>> run = calibrate([e.frame() for e in sky.exposures], sky.reference)
+    >>> periods = [([2016.0], [c.matches]) for c in run.calibrations]
+    >>> history = track_drift(run.solutions["sim"], periods)
+    >>> len(plot_drift_history(history).axes)
+    3
     """
     table = history.periods
     time, label = _time_of(table)
@@ -76,8 +88,21 @@ def plot_cell_history(history):
     Returns
     -------
     `matplotlib.figure.Figure`
-        Two maps, of both axes: a row for each cell, named by its center, a column for each period;
-        blank where a cell has too few stars.  Periods that raise an alarm are marked below.
+        Two maps, one for each axis, with a row for each cell, named by its center, and a column for
+        each period.  Cells with too few stars are blank.  Periods that raise an alarm are marked
+        below.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import calibrate, simulate
+    >>> from wpdc_gwcs.evaluation import track_drift
+    >>> from wpdc_gwcs.plotting import plot_cell_history
+    >>> sky = simulate(2, image_shape=(1000, 1000), density=30, distortion=10, seed=2)
+    >>> run = calibrate([e.frame() for e in sky.exposures], sky.reference)
+    >>> periods = [([2016.0], [c.matches]) for c in run.calibrations]
+    >>> figure = plot_cell_history(track_drift(run.solutions["sim"], periods))
+    >>> len(figure.axes[0].get_yticklabels()) > 0
+    True
     """
     table, cells = history.periods, history.cells
     place = [0.5 * (cells[f"{a}_min"].value + cells[f"{a}_max"].value) for a in ("y", "x")]

@@ -32,7 +32,7 @@ def plot_residuals_vs_magnitude(matches):
     ----------
     matches : `~astropy.table.Table`
         Matches with columns ``dx``, ``dy`` in px, and one of ``phot_g_mean_mag``, ``magnitude``,
-        ``mag``, ``snr`` or ``x_err``: the first of these that is there.
+        ``mag``, ``snr`` or ``x_err``; the first of these is used.
 
     Returns
     -------
@@ -43,7 +43,17 @@ def plot_residuals_vs_magnitude(matches):
     Raises
     ------
     ValueError
-        If none of the columns is there.
+        If the table has none of these columns.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs.plotting import plot_residuals_vs_magnitude
+    >>> x, y, dx, dy, mag = np.random.default_rng(1).uniform(18, 21, (5, 500))
+    >>> table = Table({"x": x, "y": y, "dx": dx - 19.5, "dy": dy - 19.5, "mag": mag})
+    >>> len(plot_residuals_vs_magnitude(table).axes)
+    3
     """
     labels = _MAGNITUDES | {
         "snr": "signal-to-noise ratio",
@@ -93,16 +103,17 @@ def plot_magnitude(matches, *, axes=None, width=0.5):
     ----------
     matches : `~astropy.table.Table` or iterable of them
         Columns ``x``, ``y``, ``dx``, ``dy`` in px and ``phot_g_mean_mag``, ``magnitude`` or
-        ``mag``; ``used`` and ``holdout`` if there.  Tables of several exposures are pooled.
+        ``mag``, and optionally ``used`` and ``holdout``.  Tables of several exposures are pooled.
     axes : two `matplotlib.axes.Axes`, optional
-        Where dx and dy go; new ones if not given.
+        Axes for dx and dy.  Default: new ones.
     width : float, optional
         Width of a bin, mag.
 
     Returns
     -------
     (2,) ndarray of `matplotlib.axes.Axes`
-        Shades for the density of stars, and mean and 1 sigma after 3-sigma clipping of each bin.
+        Axes with the density of stars as shades, and the mean and 1 sigma of each bin, after
+        3-sigma clipping.
 
     Raises
     ------
@@ -136,22 +147,22 @@ def plot_centroids(residuals, *, limit=None, axes=None, width=0.5):
     Parameters
     ----------
     residuals : `~astropy.table.Table` or iterable of them
-        Columns ``x``, ``y``, ``dx``, ``dy`` (measured less true position) in px and
-        ``phot_g_mean_mag``, ``magnitude`` or ``mag``; ``x_err`` and ``y_err``, px, are drawn as
-        stated errors if there.
+        Columns ``x``, ``y``, ``dx``, ``dy`` (measured minus true position) in px and
+        ``phot_g_mean_mag``, ``magnitude`` or ``mag``.  The stated errors ``x_err`` and ``y_err``,
+        in px, are drawn as well if the table has them.
     limit : (mag, sigma), optional
-        Magnitudes and the photon limit of the centroid error along one axis, px: a curve, or the
-        limits of single stars, whose medians in bins are drawn.
+        Magnitudes, and the photon limit of the centroid error along one axis in px.  They are a
+        curve, or the limits of single stars, whose binned medians are drawn.
     axes : three `matplotlib.axes.Axes`, optional
-        Where dx, dy and their scatter go; new ones if not given.
+        Axes for dx, dy and their scatter.  Default: new ones.
     width : float, optional
         Width of a bin, mag.
 
     Returns
     -------
     (3,) ndarray of `matplotlib.axes.Axes`
-        The third shows the scatter of each bin, after 3-sigma clipping, beside limit and stated
-        error.
+        The third one shows the scatter of each bin, after 3-sigma clipping, with the limit and the
+        stated error.
 
     Raises
     ------
@@ -203,9 +214,9 @@ def plot_centroids(residuals, *, limit=None, axes=None, width=0.5):
 
 
 _MAGNITUDES = {"phot_g_mean_mag": "G [mag]", "magnitude": "magnitude", "mag": "magnitude"}
-# Stars that make a bin, and those from which on shades are better than points.
+# Least number of stars in a bin, and the number above which shades replace points.
 _LEAST, _SHADED = 5, 3000
-# A curve has fewer points; more are single stars.
+# More points than this are single stars, not a curve.
 _MOST_OF_CURVE = 200
 
 
@@ -238,7 +249,7 @@ def _stars(matches):
 
 
 def _stated(residuals):
-    """Magnitude and stated error of the stars of all tables; `None` if one has none."""
+    """Magnitude and stated error of the stars of all tables; `None` if a table has no errors."""
     parts = []
     for table in as_tables(residuals):
         if not {"x_err", "y_err"} <= set(table.colnames):

@@ -12,24 +12,24 @@ __all__ = ["draw_maps", "plot_lookup_table"]
 
 
 def draw_maps(maps, extent, image_shape, *, level=99):
-    """Draw maps beside each other.
+    """Draw maps side by side.
 
     Parameters
     ----------
     maps : list of (ndarray, str, bool)
-        Values, what they are, and whether they have a sign.
+        Values, their label, and whether they have a sign.
     extent : (float, float, float, float)
-        Left, right, lower and upper edge of the maps, px.
+        Left, right, lower and upper edges of the maps, px.
     image_shape : (int, int)
-        Shape of what is drawn, ``(ny, nx)``.
+        Shape of the detector, ``(ny, nx)``.
     level : float, optional
-        Percentile at which the scale of the signed ones ends.
+        Percentile of the signed values at which their scale ends.
 
     Returns
     -------
     `matplotlib.figure.Figure`
-        The signed ones share a scale that is symmetric about zero, so that a cell with one bad star
-        does not hide the others.
+        Figure with one panel for each map.  Signed maps share a scale that is symmetric about zero
+        and ends at ``level``, so that a cell with one bad star does not hide the others.
     """
     ny, nx = image_shape
     figure = new_figure(11.5, 11.5 / 3 * min(ny / nx, 1.6) + 1.1)
@@ -69,7 +69,19 @@ def plot_lookup_table(table):
     Returns
     -------
     `matplotlib.figure.Figure`
-        Three maps, of the table's dx, dy and of its amplitude, with the nodes as pixels.
+        Three maps, of the table's dx, its dy and its amplitude, with one pixel per node.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import LookupTable
+    >>> from wpdc_gwcs.plotting import plot_lookup_table
+    >>> nodes = np.linspace(-0.5, 1023.5, 20)
+    >>> x, y = np.meshgrid(nodes, nodes)
+    >>> table = LookupTable(nodes, nodes, 0.1 * np.sin(x / 200), 0.1 * np.cos(y / 150))
+    >>> figure = plot_lookup_table(table)
+    >>> [axes.get_xlabel() for axes in figure.axes[:3]]
+    ['x [px]', 'x [px]', 'x [px]']
     """
     x, y = np.asarray(table.x_grid), np.asarray(table.y_grid)
     dx, dy = np.asarray(table.dx), np.asarray(table.dy)

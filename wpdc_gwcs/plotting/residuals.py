@@ -1,4 +1,4 @@
-"""Residuals of one frame: arrows, maps, against position, their distribution."""
+"""Residuals of one frame: as arrows, as maps, against position, and their distribution."""
 
 import numpy as np
 
@@ -73,9 +73,19 @@ def plot_residuals_vs_position(matches):
     Returns
     -------
     `matplotlib.figure.Figure`
-        Four panels.  Stars of the fit and held-out stars have their own colors, stars that are
-        neither (clipped) are gray; the line is the running median of the first two and the band
+        Four panels.  Stars of the fit and held-out stars differ in color; clipped stars are gray.
+        The line is the running median of the stars of the fit and the held-out stars, and the band
         holds the middle 68 % of them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs.plotting import plot_residuals_vs_position
+    >>> x, y, dx, dy = np.random.default_rng(1).uniform(0, 1000, (4, 500))
+    >>> table = Table({"x": x, "y": y, "dx": dx / 1e4, "dy": dy / 1e4})
+    >>> len(plot_residuals_vs_position(table).axes)
+    4
     """
     x, y, dx, dy = get_columns(matches)
     used, holdout = get_flags(matches)
@@ -138,6 +148,17 @@ def plot_residual_maps(matches, *, image_shape, n_bins=20):
     -------
     `matplotlib.figure.Figure`
         Three maps: dx, dy and stars per cell, of the stars of the fit and the held-out ones.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs.plotting import plot_residual_maps
+    >>> x, y, dx, dy = np.random.default_rng(1).uniform(0, 1000, (4, 500))
+    >>> table = Table({"x": x, "y": y, "dx": dx / 1e4, "dy": dy / 1e4})
+    >>> figure = plot_residual_maps(table, image_shape=(1000, 1000), n_bins=5)
+    >>> figure.axes[0].get_ylabel()
+    'y [px]'
     """
     used, holdout = get_flags(matches)
     good = used | holdout
@@ -168,6 +189,16 @@ def plot_cdf(matches):
     -------
     `matplotlib.figure.Figure`
         One panel with a curve for each axis; thin curves for the held-out stars.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs.plotting import plot_cdf
+    >>> x, y, dx, dy = np.random.default_rng(1).uniform(0, 1000, (4, 500))
+    >>> table = Table({"x": x, "y": y, "dx": dx / 1e4, "dy": dy / 1e4})
+    >>> plot_cdf(table).axes[0].get_xlabel()
+    'residual [px]'
     """
     _, _, dx, dy = get_columns(matches)
     used, holdout = get_flags(matches)

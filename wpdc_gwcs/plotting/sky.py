@@ -1,4 +1,4 @@
-"""Offsets on the sky: one against the other, with histograms and Gaussian fits."""
+"""Offsets on the sky, in RA against Dec, with histograms and Gaussian fits."""
 
 import warnings
 
@@ -22,7 +22,7 @@ __all__ = ["plot_sky_offsets"]
 _MAS = 3.6e6
 _COLUMNS = ("ra", "dec", "source_ra", "source_dec")
 _N_BINS = 60
-# Points that are drawn.
+# Greatest number of points that are drawn.
 _MOST_POINTS = 20_000
 
 
@@ -33,13 +33,13 @@ def plot_sky_offsets(matches, *, axes=None, limit=None, title=None):
     ----------
     matches : `~astropy.table.Table` or iterable of them
         Columns ``ra``, ``dec`` of the reference star and ``source_ra``, ``source_dec`` of the
-        source, in deg, as in ``matches.ecsv``; ``used`` and ``holdout`` if there.  Tables of
+        source, in deg, as in ``matches.ecsv``, and optionally ``used`` and ``holdout``.  Tables of
         several exposures are pooled.
     axes : `matplotlib.axes.Axes`, optional
-        Its area is divided between the offsets and, above and to the right, their histograms.  New
-        ones if not given.
+        Axes to draw into: they are divided into the offsets and, above and to the right, their
+        histograms.  Default: new ones.
     limit : float, optional
-        Half of the range that is shown, mas; by default five times the scatter, plus the mean.
+        Half of the range that is shown, mas.  Default: the mean plus five times the scatter.
     title : str, optional
         Title of the figure.
 
@@ -145,7 +145,7 @@ def _offsets(matches):
 def _fit_gaussian(values):
     """Fit a Gaussian to the histogram: mean, sigma, stars per mas at the top.
 
-    Median and robust scatter stand for it where it does not converge.
+    If the fit does not converge, median and robust scatter take its place.
     """
     middle, scatter = float(np.median(values)), robust_scatter(values)
     if not scatter > 0:

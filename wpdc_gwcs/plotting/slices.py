@@ -1,4 +1,4 @@
-"""Mean residuals in slices of a detector, several solutions together."""
+"""Mean residuals in slices of a detector, for several solutions."""
 
 import numpy as np
 
@@ -23,13 +23,13 @@ def plot_slices(residuals, *, image_shape, axes=None, width=512):
     Parameters
     ----------
     residuals : dict
-        Label to what it stands for, for example ``unweighted`` and ``weighted``: a table with
-        columns ``x``, ``y``, ``dx``, ``dy`` in px, an iterable of them, or a `WeightResult` of
-        `~wpdc_gwcs.evaluation.compare_weights`.
+        Residuals of each solution by its label, for example ``unweighted`` and ``weighted``.  They
+        are a table with columns ``x``, ``y``, ``dx``, ``dy`` in px, an iterable of tables, or a
+        `WeightResult` of `~wpdc_gwcs.evaluation.compare_weights`.
     image_shape : (int, int)
         Shape of the detector, ``(ny, nx)``.
     axes : two `matplotlib.axes.Axes`, optional
-        Where dx against x and dy against y go; new ones if not given.
+        Axes for dx against x and dy against y.  Default: new ones.
     width : float, optional
         Width of a slice, px; the paper's is 512.
 
@@ -65,7 +65,7 @@ def plot_slices(residuals, *, image_shape, axes=None, width=512):
     if not width > 0:
         raise ValueError(f"width must be positive px, got {width}")
     if not residuals:
-        raise ValueError("residuals must have one solution at least")
+        raise ValueError("residuals must have at least one solution")
     ny, nx = image_shape
     axes = given_axes(axes, 2, 9.5, 4.0, sharey=True)
     colors = (BLUE, ORANGE, *OTHERS)
@@ -96,13 +96,13 @@ def _columns(matches):
 
 
 def _slices(position, residual, n, width):
-    """Center, mean and both ends of the bar of each slice that has stars."""
+    """Center, mean, and lower and upper end of the bar of each slice that has stars."""
     count = max(1, int(np.ceil(n / width)))
     number = np.clip(((position + 0.5) // width).astype(int), 0, count - 1)
     order = np.argsort(number, kind="stable")
     parts = np.split(residual[order], np.searchsorted(number[order], np.arange(1, count)))
     rows = np.array([clipped_statistics(part) for part in parts])
-    # The last slice may be a narrow one.
+    # The last slice may be narrower.
     edges = np.minimum(np.arange(count + 1) * width, n) - 0.5
     center = 0.5 * (edges[1:] + edges[:-1])
     good = np.isfinite(rows[:, 0])

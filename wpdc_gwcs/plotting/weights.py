@@ -24,20 +24,31 @@ def plot_weights(results, axes=None, *, component="dx"):
     results : list of WeightResult
         As returned by `~wpdc_gwcs.evaluation.compare_weights`.
     axes : `matplotlib.axes.Axes`, optional
-        Where one distribution goes.
+        Axes for one distribution.  Default: a new figure with all four.
     component : {'dx', 'dy', 'table_dx', 'table_dy'}, optional
-        Which one goes into ``axes``: of the polynomial alone, or with its table.
+        Distribution that goes into ``axes``: of the polynomial alone, or with its table.
 
     Returns
     -------
     `matplotlib.figure.Figure` or `matplotlib.axes.Axes`
-        The axes that were given; without, a figure of four panels: both axes of the detector,
-        without and with a look-up table.  d80 of each weight is in the keys.
+        The given axes.  Without ``axes``, a figure of four panels: both axes of the detector,
+        without and with a look-up table.  The legends have the d80 of each weight.
 
     Raises
     ------
     ValueError
-        If there is no such component.
+        If ``component`` is none of these.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import calibrate, simulate
+    >>> from wpdc_gwcs.evaluation import compare_weights
+    >>> from wpdc_gwcs.plotting import plot_weights
+    >>> sky = simulate(2, image_shape=(1000, 1000), density=30, distortion=10, seed=2)
+    >>> run = calibrate([e.frame() for e in sky.exposures], sky.reference)
+    >>> figure = plot_weights(compare_weights(run.calibrations))
+    >>> len(figure.axes)
+    4
     """
     if component not in _COMPONENTS:
         raise ValueError(f"component must be one of {', '.join(_COMPONENTS)}, got {component!r}")
@@ -85,7 +96,7 @@ def _draw(axes, results, name, limit):
         )
     axes.set_xlim(-limit, limit)
     axes.set_ylim(0, 1)
-    # Few enough for labels such as -0.075 to stand apart.
+    # Labels such as -0.075 must not touch.
     axes.locator_params(axis="x", nbins=5)
     axes.set_xlabel(_COMPONENTS[name])
     axes.legend(
