@@ -550,7 +550,7 @@ def test_degree_is_as_asked_for(tmp_path, form):
 
 def test_degree_has_no_meaning_for_tables(tmp_path, calibration):
     for form in ("tab", "stock", "asdf"):
-        with pytest.raises(ValueError, match="degree has no meaning"):
+        with pytest.raises(ValueError, match="degree must be None"):
             write(calibration, tmp_path / "a", format=form, degree=3)
 
 

@@ -128,7 +128,7 @@ class TestResidualMap:
         assert "0 stars" in repr(empty)
 
     def test_errors(self):
-        with pytest.raises(ValueError, match="must be of one geometry"):
+        with pytest.raises(ValueError, match="must have the same geometry"):
             ResidualMap(SHAPE) + ResidualMap((1500, 2000))
         with pytest.raises(ValueError, match="sums must have shape"):
             ResidualMap(SHAPE, np.zeros((3, 3)))

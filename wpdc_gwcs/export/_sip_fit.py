@@ -29,11 +29,11 @@ def fit_sip(pixels, plane, degree, weights=None):
     pixels : (2, N) ndarray
         Zero-based pixels.
     plane : (2, N) ndarray
-        Tangent-plane coordinates of these, deg.
+        Their tangent-plane coordinates, deg.
     degree : int
         Degree, 2 or more.
     weights : (N,) ndarray, optional
-        Of the squares of the errors; all the same by default.
+        Weights of the squared errors.  Default: equal weights.
 
     Returns
     -------
@@ -43,8 +43,8 @@ def fit_sip(pixels, plane, degree, weights=None):
     Notes
     -----
     A SIP polynomial has no constant and no linear terms (Shupe et al. 2005, ASP Conf. Ser. 347,
-    491).  The linear ones go into CD; CRPIX is where the fitted map is zero, so that no constant is
-    left.
+    491).  The linear terms go into CD.  CRPIX is the point where the fitted map is zero, which
+    leaves no constant term.
     """
     center = pixels.mean(axis=1)
     scale = np.abs(pixels - center[:, np.newaxis]).max()
@@ -58,12 +58,12 @@ def fit_sip(pixels, plane, degree, weights=None):
 
 
 def fit_sip_inverse(sip, pixels, plane, degree):
-    """Fit the polynomials of the way back, which viewers use.
+    """Fit the inverse polynomials, which viewers use.
 
     Parameters
     ----------
     sip : SipFit
-        The way there.
+        The forward polynomials.
     pixels, plane : (2, N) ndarray
         Zero-based pixels and their tangent-plane coordinates, deg.
     degree : int
@@ -72,7 +72,7 @@ def fit_sip_inverse(sip, pixels, plane, degree):
     Returns
     -------
     terms : (2, degree + 1, degree + 1) ndarray
-        AP and BP; constant and linear terms are allowed there.
+        AP and BP, which may have constant and linear terms.
     worst : float
         Greatest distance from the pixels, px.
     """
@@ -87,7 +87,7 @@ def _fit_terms(u, v, values, scale, degree, *, least, weights=None):
     """Fit coefficients [axis, p, q] of u^p v^q with least <= p + q <= degree."""
     root = 1.0 if weights is None else np.sqrt(weights)[:, np.newaxis]
     powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p) if p + q >= least]
-    # A scaled basis keeps the powers comparable.
+    # Scaled coordinates keep all powers of the same size.
     design = np.column_stack([(u / scale) ** p * (v / scale) ** q for p, q in powers])
     solution = np.linalg.lstsq(design * root, values.T * root, rcond=None)[0]
     terms = np.zeros((2, degree + 1, degree + 1))
@@ -97,7 +97,7 @@ def _fit_terms(u, v, values, scale, degree, *, least, weights=None):
 
 
 def _root(terms):
-    """Find where a fitted polynomial map is zero."""
+    """Find the zero of a fitted polynomial map."""
     z = -np.linalg.solve(np.column_stack([terms[:, 1, 0], terms[:, 0, 1]]), terms[:, 0, 0])
     for _ in range(50):
         value = np.array([polynomial.polyval2d(*z, c) for c in terms])

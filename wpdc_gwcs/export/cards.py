@@ -13,14 +13,14 @@ FORMAT_VERSION = "1.2.0"
 
 
 def number_card(keyword, value, comment=""):
-    """Make a card with 17 significant digits, which bring every float64 back.
+    """Make a card with 17 significant digits, from which every float64 is read back exactly.
 
     Parameters
     ----------
     keyword : str
         Keyword.
     value : float
-        Its value; astropy would write 16 digits.
+        Value; astropy alone would write 16 digits.
     comment : str, optional
         Comment.
 
@@ -79,7 +79,7 @@ def frame_cards(obj):
     Parameters
     ----------
     obj : Calibration or DistortionSolution
-        Whose.
+        Calibration or solution that is exported.
 
     Returns
     -------
@@ -105,14 +105,14 @@ def frame_cards(obj):
 
 
 def add_history(header, text):
-    """Add HISTORY cards, as many lines as it takes.
+    """Add a text to a header as HISTORY cards.
 
     Parameters
     ----------
     header : `~astropy.io.fits.Header`
-        Changed in place.
+        Header, changed in place.
     text : str
-        What to add.
+        Text, of any length.
     """
     for line in textwrap.wrap(_ascii(text), 70, subsequent_indent="  "):
         header.add_history(line)

@@ -1,4 +1,4 @@
-"""CPDIS: look-up tables before CD and PV (FITS WCS Paper IV), as applied by astropy.wcs."""
+"""CPDIS: look-up tables before CD and PV (FITS WCS Paper IV), as astropy.wcs applies them."""
 
 import numpy as np
 from astropy.io import fits
@@ -10,35 +10,35 @@ from wpdc_gwcs.export.tpv import fold_polynomial, tpv_keywords
 
 __all__ = ["cpdis_form"]
 
-_TOLERANCE_PX = 5e-4  # aimed at; 1e-3 is promised
+_TOLERANCE_PX = 5e-4  # half of the promised 1e-3 px
 _MOST_NODES = 1 << 22
 
 
 def cpdis_form(obj, *, first_version=1):
-    """Return TPV keywords and the look-up table in a form for plain astropy.wcs.
+    """Return TPV keywords and look-up tables that plain astropy.wcs can use.
 
     Parameters
     ----------
     obj : Calibration or DistortionSolution
         What is exported.
     first_version : int, optional
-        EXTVER of the table of the first axis; the second has the next one.
+        EXTVER of the table of the first axis; that of the second axis is one more.
 
     Returns
     -------
     header : `~astropy.io.fits.Header`
         The keywords.
     tables : list of `~astropy.io.fits.ImageHDU`
-        ``WCSDVARR``; none where there is no look-up table.
+        Extensions ``WCSDVARR``; none if there is no look-up table.
     deviation : float
         Largest deviation from the exact WCS, px.
 
     Notes
     -----
-    ``CPDIS`` acts on the pixel position, before CD and PV, and is bilinear.  The shift d that has
-    the same effect there as the table after PV is found at every node by Newton's method:
-    ``PV(CD (x + d - CRPIX)) = PV(CD (x - CRPIX)) - CD table(x)``.  The nodes are made denser by
-    factors of two until astropy.wcs agrees everywhere.
+    ``CPDIS`` acts on the pixel position, before CD and PV, and is bilinear.  Newton's method finds
+    the shift d at every node that has the same effect there as the table has after PV:
+    ``PV(CD (x + d - CRPIX)) = PV(CD (x - CRPIX)) - CD table(x)``.  The density of nodes is doubled
+    until astropy.wcs agrees everywhere.
     """
     require_shape(obj)
     header, tables = tpv_keywords(obj, fold_polynomial(obj)), []
@@ -61,7 +61,7 @@ def cpdis_form(obj, *, first_version=1):
 
 
 def _prior_shift(obj, x, y):
-    """Shift of the pixel position that does in front of PV what the table does behind it."""
+    """Shift of the pixel position before PV that is equivalent to the table after PV."""
     exact = description(obj)
     solution, cd = exact.solution, exact.cd
     pv = fold_polynomial(obj)

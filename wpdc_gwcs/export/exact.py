@@ -1,4 +1,4 @@
-"""The exact WCS from which exports are made and with which they are compared."""
+"""The exact WCS: exports are made from it and compared with it."""
 
 import warnings
 from typing import NamedTuple
@@ -42,12 +42,12 @@ def description(obj):
     Returns
     -------
     exact : ExactWCS
-        Its parts.
+        Instrument, matrix, reference point and name.
 
     Raises
     ------
     TypeError
-        If it is neither.
+        If the object is neither of these.
     """
     solution = getattr(obj, "solution", obj)
     if not all(hasattr(solution, name) for name in ("crpix", "pv", "lookup_table")):
@@ -66,7 +66,7 @@ def image_shape_of(obj):
     Returns
     -------
     shape : (int, int) or None
-        The nodes of a table run from edge to edge, so they tell, too.
+        The stated shape, or else the one that the nodes of the table span.
     """
     shape, table = description(obj).solution.image_shape, obj.lookup_table
     if shape is None and table is not None:
@@ -85,12 +85,12 @@ def require_shape(obj):
     Returns
     -------
     shape : (int, int)
-        As `image_shape_of`.
+        Shape ``(ny, nx)``, as from `image_shape_of`.
 
     Raises
     ------
     FileFormatError
-        If it is unknown.
+        If the shape is unknown.
     """
     shape = image_shape_of(obj)
     if shape is None:
@@ -104,16 +104,16 @@ def deviation(obj, sky, *, n=401):
     Parameters
     ----------
     obj : Calibration or DistortionSolution
-        The exact one.
+        Object with the exact WCS.
     sky : callable
-        ``sky(x, y)`` -> RA, Dec in deg of zero-based pixels.
+        Other WCS: ``sky(x, y)`` returns RA and Dec in deg of zero-based pixels.
     n : int, optional
-        Points along each side of a grid from edge to edge.
+        Number of points along each side of the grid, which runs from edge to edge.
 
     Returns
     -------
     deviation : float
-        In undistorted pixels; infinite if the other WCS gives NaN anywhere.
+        Greatest distance in undistorted pixels; infinite if the other WCS returns NaN anywhere.
     """
     exact = description(obj)
     ny, nx = require_shape(obj)
@@ -139,7 +139,7 @@ def astropy_wcs(header, tables=()):
     Returns
     -------
     wcs : `~astropy.wcs.WCS`
-        With the tables.
+        The WCS, its tables included.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -147,7 +147,7 @@ def astropy_wcs(header, tables=()):
 
 
 def astropy_sky(header, tables=()):
-    """Return the WCS of a header by astropy.wcs, as a function of zero-based pixels.
+    """Return the WCS of a header as a function of zero-based pixels, evaluated by astropy.wcs.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def sample_plane(obj):
     """
     exact = description(obj)
     ny, nx = require_shape(obj)
-    # Chebyshev points make least squares nearly the best approximation in the greatest error.
+    # With Chebyshev points, least squares nearly minimizes the greatest error.
     t = np.cos(np.pi * (np.arange(64) + 0.5) / 64)
     x, y = np.meshgrid(0.5 * (nx - 1) + 0.5 * nx * t, 0.5 * (ny - 1) + 0.5 * ny * t)
     x, y = x.ravel(), y.ravel()

@@ -1,4 +1,4 @@
-"""A calibration in the forms that readers of FITS understand.
+"""FITS forms of a calibration, for different readers.
 
 ========= ============================================================== =======================
 form      content                                                        exact for
@@ -40,21 +40,21 @@ class FitsForm:
     form : str
         One of `FORMS`.
     header : `~astropy.io.fits.Header`
-        WCS keywords alone.
+        WCS keywords only.
     tables : tuple of HDU
         Extensions that readers of the form need.
     deviation : float or None
-        Largest deviation from the exact WCS over the detector for these readers, px; `None` where
-        it is exact, or where the shape of the detector is unknown.
+        Largest deviation from the exact WCS over the detector, in px, for readers of the form;
+        `None` if the form is exact or the shape of the detector is unknown.
     keywords_deviation : float or None
-        For ``fits``: the same for readers of the keywords alone.
+        For ``fits``: the same for readers that ignore the table.
     inverse_deviation : float or None
         For ``sip``: largest deviation of the inverse polynomials, px.
     swarp_deviation : float or None
-        For ``tpv`` and ``head``: largest deviation in SWarp, whose way from sky to pixel is not
-        exact, px.
+        For ``tpv`` and ``head``: largest deviation in SWarp, px, which inverts the polynomial
+        approximately.
     written : Calibration or DistortionSolution or None
-        For ``fits`` and ``cpdis``: the same mapping with the polynomial that the keywords have.
+        For ``fits`` and ``cpdis``: the same mapping, with the polynomial of the keywords.
     """
 
     form: str
@@ -68,7 +68,7 @@ class FitsForm:
 
 
 def make_form(obj, form, *, degree=None, versions: Mapping = MappingProxyType({})):
-    """Return the WCS of a calibration in a form of FITS.
+    """Return the WCS of a calibration in one of the FITS forms.
 
     Parameters
     ----------
@@ -77,10 +77,11 @@ def make_form(obj, form, *, degree=None, versions: Mapping = MappingProxyType({}
     form : {"fits", "cpdis", "tpv", "head", "sip", "tab"}
         The form.
     degree : int, optional
-        Degree of the polynomials.  By default that of the solution for ``fits`` and ``cpdis``, for
-        ``tpv``, ``head`` and ``sip`` the lowest that is good to 1e-3 px or nearly as good as any.
+        Degree of the polynomials.  Default: that of the solution for ``fits`` and ``cpdis``; for
+        ``tpv``, ``head`` and ``sip``, the lowest degree that is accurate to 1e-3 px or nearly as
+        accurate as any.
     versions : mapping of str to int, optional
-        EXTVER of the first table of each EXTNAME, for files that have such tables already.
+        EXTVER of the first table of each EXTNAME, for files that already have such tables.
 
     Returns
     -------
@@ -90,7 +91,7 @@ def make_form(obj, form, *, degree=None, versions: Mapping = MappingProxyType({}
     Raises
     ------
     ValueError
-        If the form is unknown, has no polynomials or not of this degree.
+        If the form is unknown, or has no polynomials of this degree.
     FileFormatError
         If the shape of the detector is needed and unknown.
     """
@@ -110,7 +111,7 @@ def make_form(obj, form, *, degree=None, versions: Mapping = MappingProxyType({}
     if form == "tab":
         if degree is not None:
             raise ValueError(
-                f"degree has no meaning for 'tab', which has no polynomials, got {degree}"
+                f"degree must be None for 'tab', which has no polynomials, got {degree}"
             )
         header, tables, worst = tab_form(obj, version=versions.get(TAB_NAME, 1))
         return FitsForm(form, header, tuple(tables), worst)

@@ -4,9 +4,10 @@
 
     w_0 = 1,    w_k+1 = w_k |e_k|^b,    e_k: errors of the fit with weights w_k
 
-This is Lawson's method for the best approximation (C. L. Lawson, thesis, UCLA 1961).  b is below
-one, because the iteration oscillates with one.  If a table has waves that no polynomial can follow,
-least squares leave the crest of the highest wave as it is; these weights reduce it by a third.
+This is Lawson's method for the best uniform approximation (C. L. Lawson, thesis, UCLA 1961), with b
+less than one, because the iteration oscillates for b = 1.  If a table has waves that no polynomial
+can follow, least squares leaves the crest of the highest wave unchanged; these weights reduce it by
+a third.
 """
 
 import numpy as np
@@ -15,9 +16,9 @@ from numpy.polynomial import chebyshev
 __all__ = ["levelling_weights"]
 
 _POWER = 0.5
-# Nearly all is gained in the first dozen rounds, and nothing after forty.
+# A dozen rounds gain nearly everything, and rounds after the fortieth gain nothing.
 _ROUNDS = 40
-# What the worst place gains must not cost all others more than this factor in their mean square.
+# The gain at the worst place must not increase the mean square error by more than this factor.
 _MOST_RMS = 1.5
 
 
@@ -29,14 +30,14 @@ def levelling_weights(pixels, values, degree):
     pixels : (2, N) ndarray
         Points.
     values : (2, N) ndarray
-        What is fitted, in px, so that both axes count the same.
+        Values to fit, in px, so that both axes count equally.
     degree : int
         Total degree of the polynomial; its basis does not matter.
 
     Returns
     -------
     weights : (N,) ndarray
-        Of the squares of the errors; all one if nothing can be gained.
+        Weights of the squared errors; all one if nothing can be gained.
     """
     low, high = pixels.min(axis=1), pixels.max(axis=1)
     u, v = (2.0 * pixels.T - low - high).T / (high - low)[:, np.newaxis]

@@ -22,17 +22,17 @@ class InMemory:
         Parameters
         ----------
         format : {"tpv", "sip"}, optional
-            TPV polynomials, for SWarp, SCAMP, GalSim and astropy; or SIP polynomials, for DS9 and
-            all viewers.  Both are fitted to the whole mapping, look-up table included.
+            TPV polynomials, for SWarp, SCAMP, GalSim and astropy, or SIP polynomials, for DS9 and
+            other viewers.  Both are fitted to the whole mapping, including the look-up table.
         degree : int, optional
-            Degree of the polynomials; by default the lowest that is accurate to 1e-3 px or nearly
-            as good as any other.
+            Degree of the polynomials.  Default: the lowest one that is accurate to 1e-3 px or
+            nearly as good as any other.
 
         Returns
         -------
         header : `~astropy.io.fits.Header`
-            With NAXIS1 and NAXIS2; its card ``WPDCDEV`` has the largest deviation from the exact
-            WCS, px.
+            Header with NAXIS1, NAXIS2 and the WCS.  Its card ``WPDCDEV`` has the largest deviation
+            from the exact WCS, px.
 
         Raises
         ------
@@ -60,17 +60,17 @@ class InMemory:
         Parameters
         ----------
         format : {"tpv", "sip", "cpdis", "tab"}, optional
-            Polynomials fitted to the whole mapping (``tpv``, ``sip``), or polynomials and look-up
-            tables (``cpdis``) or a table alone (``tab``), accurate to 1e-3 px.  The tables of
-            astropy are not adapted if the WCS is sliced or written with
+            Polynomials fitted to the whole mapping (``tpv``, ``sip``), polynomials with look-up
+            tables (``cpdis``), or a table alone (``tab``).  The tables are accurate to 1e-3 px, but
+            astropy does not adapt them when the WCS is sliced or written with
             `~astropy.wcs.WCS.to_header`.
         degree : int, optional
-            Degree of the polynomials.
+            Degree of the polynomials.  Default: as for `make_form`.
 
         Returns
         -------
         wcs : `~astropy.wcs.WCS`
-            With the shape of the detector.
+            The WCS, with the shape of the detector.
 
         Raises
         ------
@@ -94,7 +94,7 @@ class InMemory:
         data : (ny, nx) array_like or `~astropy.units.Quantity`
             The image.
         format : {"tpv", "sip"}, optional
-            As for `to_header`.  These are kept in cut-outs and files of a CCDData; tables are not.
+            As for `to_header`.  Cut-outs and files of a CCDData keep these forms, but not tables.
         degree : int, optional
             Degree of the polynomials.
         **kwargs
@@ -103,12 +103,12 @@ class InMemory:
         Returns
         -------
         image : `~astropy.nddata.CCDData`
-            In ``adu`` unless a unit is given.
+            The image with the WCS, in ``adu`` unless a unit is given.
 
         Raises
         ------
         ValueError
-            If the image has another shape than the detector, or the format needs tables.
+            If the image does not have the shape of the detector, or the format needs tables.
         """
         from astropy.nddata import CCDData
 
@@ -119,7 +119,7 @@ class InMemory:
         shape = image_shape_of(self)
         if shape is not None and tuple(data.shape) != tuple(shape):
             raise ValueError(
-                f"data must have the shape of the detector, {tuple(shape)}, not {data.shape}"
+                f"data must have the shape of the detector, {tuple(shape)}, got {data.shape}"
             )
         if not hasattr(data, "unit"):
             kwargs.setdefault("unit", "adu")

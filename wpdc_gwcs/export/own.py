@@ -1,4 +1,4 @@
-"""The tables of this package in FITS files: the look-up table as in the paper, the instrument."""
+"""FITS tables of this package: the look-up table, as in the paper, and the instrument."""
 
 import numpy as np
 from astropy.io import fits
@@ -14,7 +14,7 @@ TABLE_COLUMNS = ("X_GRID", "Y_GRID", "DX_LUT", "DY_LUT")
 
 
 def own_tables(obj, *, version=1):
-    """Make the tables that bring the instrument back exactly.
+    """Make the tables from which the instrument is read back exactly.
 
     Parameters
     ----------
@@ -26,14 +26,14 @@ def own_tables(obj, *, version=1):
     Returns
     -------
     tables : list of `~astropy.io.fits.BinTableHDU`
-        The instrument, and the look-up table where there is one.
+        The instrument, and the look-up table if there is one.
 
     Notes
     -----
     ``WPDC_LUT`` has one row for each node, x running fastest: ``X_GRID``, ``Y_GRID`` in FITS pixels
-    (from one) and ``DX_LUT``, ``DY_LUT``, px, to be subtracted from the undistorted position.  The
-    one row of ``WPDC_INSTRUMENT`` has CD0, PV0, the zero-based CRPIX and the nominal CRVAL as they
-    are, so that what is read back is the same to the last bit.
+    (from one), and ``DX_LUT``, ``DY_LUT`` in px, to be subtracted from the undistorted position.
+    The single row of ``WPDC_INSTRUMENT`` has CD0, PV0, the zero-based CRPIX and the nominal CRVAL,
+    which are read back without rounding.
     """
     solution = description(obj).solution
     pv, table = solution.pv, obj.lookup_table

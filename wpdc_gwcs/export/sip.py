@@ -1,4 +1,4 @@
-"""TAN-SIP: polynomials of pixels, fitted to everything."""
+"""TAN-SIP: polynomials of pixels, fitted to the whole mapping."""
 
 import numpy as np
 
@@ -12,21 +12,21 @@ __all__ = ["sip_keywords"]
 _DEGREES = range(2, 10)
 # A fit this good (px) is good enough.
 _ENOUGH_PX = 1e-4
-# Where none is, the lowest degree that is as good as the best but for so much.
+# If no fit is that good: how much worse than the best one a lower degree may be.
 _NEARLY = 1.1
-# What the way back may add, px.
+# Error that the inverse polynomials may add, px.
 _INVERSE_PX = 1e-3
 
 
 def sip_keywords(obj, degree=None):
-    """Find the SIP polynomials that are nearest to the whole mapping, look-up table included.
+    """Fit SIP polynomials to the whole mapping, including the look-up table.
 
     Parameters
     ----------
     obj : Calibration or DistortionSolution
         What is exported.
     degree : int, optional
-        Degree of the polynomials, 2 to 9; the lowest that is nearly as good as any by default.
+        Degree of the polynomials, 2 to 9.  Default: the lowest that is nearly as good as any.
 
     Returns
     -------
@@ -44,8 +44,8 @@ def sip_keywords(obj, degree=None):
 
     Notes
     -----
-    SIP has no constant and no linear terms (Shupe et al. 2005, ASP Conf. Ser. 347, 491): the linear
-    ones go into CD, and CRPIX moves to where the sky is CRVAL.
+    SIP has no constant and no linear terms (Shupe et al. 2005, ASP Conf. Ser. 347, 491).  The
+    linear terms go into CD, and CRPIX moves to the pixel whose position is CRVAL.
     """
     if degree is not None and degree not in _DEGREES:
         raise ValueError(f"degree must be from 2 to 9 for SIP, got {degree}")

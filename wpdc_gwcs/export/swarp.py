@@ -1,4 +1,4 @@
-"""The inverse of SWarp from the sky to pixels, and the linear part for which it is accurate.
+"""How SWarp goes from sky to pixels, and the linear part for which it is accurate.
 
 ::
 
@@ -16,30 +16,30 @@ from scipy.optimize import least_squares
 __all__ = ["nearer_linear_part", "step_errors"]
 
 _STEPS = 3
-# Above this, deg, SWarp takes a polynomial fitted to the inverse instead of its steps.
+# If the steps leave more than this, deg, SWarp uses a polynomial fitted to the inverse instead.
 _MOST_DEG = 1e-3
-# Nodes along each axis that the linear part is chosen on; the worst ones are at the edges.
+# Nodes along each axis for the choice of the linear part; the worst errors are at the edges.
 _NODES = 13
-# Evaluations of the errors and their derivatives, which end as good as do a hundred.
+# Evaluations of the errors and their derivatives; a hundred give no better result.
 _MOST_EVALUATIONS = 30
 
 
 def step_errors(pv, u, plane):
-    """Errors of the three steps.
+    """Compute the errors of the three steps.
 
     Parameters
     ----------
     pv : callable
         Polynomial, ``pv(u, v)``.
     u : (2, N) ndarray
-        Where the steps should end, deg.
+        Correct results of the steps, deg.
     plane : (2, N) ndarray
-        Standard coordinates that they start from, deg.
+        Standard coordinates that the steps start from, deg.
 
     Returns
     -------
     errors : (2, N) ndarray or None
-        Where they end less where they should, deg; `None` if SWarp would not make them.
+        Results minus correct results, deg; `None` if SWarp would not use the steps.
     """
     errors = _steps(pv, plane) - u
     return None if np.abs(errors).max(initial=0.0) > _MOST_DEG else errors
@@ -51,7 +51,7 @@ def nearer_linear_part(pv, cd, crpix, image_shape):
     Parameters
     ----------
     pv : callable
-        Polynomial behind the present linear part.
+        Polynomial after the present linear part.
     cd : (2, 2) ndarray
         Present matrix, deg / px.
     crpix : (2,) ndarray
@@ -62,7 +62,7 @@ def nearer_linear_part(pv, cd, crpix, image_shape):
     Returns
     -------
     cd, crpix : ndarray
-        The new ones, with ``U = M U' + t`` between the old and the new coordinates.
+        New matrix and reference point.  Old and new coordinates are related by ``U = M U' + t``.
     matrix : (2, 2) ndarray
         M.
     offset : (2,) ndarray
@@ -70,15 +70,15 @@ def nearer_linear_part(pv, cd, crpix, image_shape):
 
     Notes
     -----
-    The sum of the fourth powers of the errors over a grid is made small, which is nearly their
-    greatest one.
+    The sum of the fourth powers of the errors over a grid is minimized, which nearly minimizes the
+    greatest error.
     """
     ny, nx = image_shape
     x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, _NODES), np.linspace(-0.5, ny - 0.5, _NODES))
     u = cd @ (np.array([x.ravel(), y.ravel()]) - np.reshape(crpix, (2, 1)))
     plane = np.array(pv(*u))
     pixel = np.sqrt(abs(np.linalg.det(cd)))
-    # Changes of a hundredth of the matrix, and of a thousandth of the detector.
+    # Steps: a hundredth of the matrix, and a thousandth of the detector.
     steps = np.array([1e-2] * 4 + [1e-3 * max(nx, ny) * pixel] * 2)
 
     def parts(changes):

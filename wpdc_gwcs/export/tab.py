@@ -10,13 +10,13 @@ __all__ = ["TAB_NAME", "tab_form"]
 
 #: EXTNAME of the table.
 TAB_NAME = "WPDC_TAB"
-_TOLERANCE_PX = 5e-4  # aimed at; 1e-3 is promised
+_TOLERANCE_PX = 5e-4  # half of the promised 1e-3 px
 _FIRST_NODES = 33
 _MOST_NODES = 1 << 22
 
 
 def tab_form(obj, *, version=1):
-    """Return the sky at nodes, dense enough for bilinear interpolation.
+    """Return a table of sky positions at nodes, dense enough for bilinear interpolation.
 
     Parameters
     ----------
@@ -37,9 +37,9 @@ def tab_form(obj, *, version=1):
     Notes
     -----
     The nodes run from edge to edge of the detector.  The error of bilinear interpolation falls with
-    the square of their distance, so the first try shows how many are needed.  Right ascension is
-    not wrapped at 360 degrees within the table.  A pole on the detector cannot be represented,
-    which shows in the deviation.
+    the square of their distance, so a first table shows how many nodes are needed.  Right ascension
+    does not wrap at 360 degrees within the table.  A pole on the detector cannot be represented;
+    the deviation shows this.
     """
     require_shape(obj)
     n = _FIRST_NODES

@@ -1,4 +1,4 @@
-"""TPV: the polynomial of a calibration as it is, or fitted to everything.
+"""TPV: the polynomial of a calibration itself, or one fitted to the whole mapping.
 
 ::
 
@@ -30,21 +30,21 @@ __all__ = ["TpvFit", "fit_tpv", "fold_polynomial", "nearest_polynomial", "refit"
 
 # A fit this good (px) is good enough; a higher degree would only be harder to read.
 _ENOUGH_PX = 1e-3
-# Where none is, the lowest degree that is as good as the best but for so much; and how much more is
-# nearly as good to SWarp.
+# If no fit is that good: how much worse than the best one a lower degree may be, and how much
+# worse in SWarp.
 _AS_GOOD, _NEARLY = 1.02, 1.1
 _DEGREES = range(1, 8)
-# Nodes along each axis of the table of what a polynomial leaves, where there was none.
+# Nodes along each axis of a table for the residuals of a polynomial, if there was no table.
 _TABLE_NODES = 50
 
 
 class TpvFit(NamedTuple):
-    """TPV that is near to a mapping.
+    """TPV fitted to a mapping.
 
-    ``crpix`` (px, zero based), ``cd`` (deg / px), the polynomial ``pv`` behind them, and the
-    largest deviation from the exact WCS in px: ``deviation`` for readers that do as the keywords
-    say, ``swarp_deviation`` for SWarp, which goes from sky to pixel by three steps.  `None` where
-    the shape of the detector is unknown, or the way of SWarp.
+    It has ``crpix`` (px, zero based), ``cd`` (deg / px), the polynomial ``pv`` that follows them,
+    and the largest deviations from the exact WCS in px: ``deviation`` for exact readers, and
+    ``swarp_deviation`` for SWarp, which goes from sky to pixel in three steps.  They are `None` if
+    they are unknown, for example because the shape of the detector is.
     """
 
     crpix: np.ndarray
@@ -80,18 +80,18 @@ def tpv_keywords(obj, pv, *, crpix=None, cd=None):
     Parameters
     ----------
     obj : Calibration or DistortionSolution
-        Where CRVAL is from, and CRPIX and CD by default.
+        Source of CRVAL, and of CRPIX and CD by default.
     pv : PVPolynomial
         The polynomial.
     crpix : (2,) array_like, optional
-        Reference point in front of it, px, zero based.
+        Reference point before the polynomial, px, zero based.
     cd : (2, 2) array_like, optional
-        Matrix in front of it, deg / px.
+        Matrix before the polynomial, deg / px.
 
     Returns
     -------
     header : `~astropy.io.fits.Header`
-        Numbers with 17 digits.
+        Header; all numbers have 17 digits.
     """
     exact = description(obj)
     crpix = exact.solution.crpix if crpix is None else crpix
@@ -103,7 +103,7 @@ def tpv_keywords(obj, pv, *, crpix=None, cd=None):
 
 
 def fit_tpv(obj, degree=None):
-    """Find the TPV that is nearest to the whole mapping, look-up table included.
+    """Fit a TPV to the whole mapping, including the look-up table.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def fit_tpv(obj, degree=None):
     Returns
     -------
     tpv : TpvFit
-        CRPIX and CD are those of the exposure, unless SWarp comes nearer with others.
+        The fit.  CRPIX and CD are those of the exposure, unless SWarp is more accurate with others.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def fit_tpv(obj, degree=None):
         return plain
     plain = plain._replace(swarp_deviation=_swarp_deviation(obj, plain))
     left = plain.swarp_deviation
-    # Radial terms are not to be had about another point.
+    # Radial terms cannot be moved to another center.
     if pv.radial or (left is not None and left <= max(_NEARLY * worst, _ENOUGH_PX)):
         return plain
     cd, crpix, matrix, offset = nearer_linear_part(pv, plain.cd, plain.crpix, image_shape_of(obj))
@@ -147,20 +147,20 @@ def fit_tpv(obj, degree=None):
 
 
 def nearest_polynomial(obj, degree=None):
-    """Find the polynomial that is nearest to the whole mapping, look-up table included.
+    """Fit a polynomial to the whole mapping, including the look-up table.
 
     Parameters
     ----------
     obj : Calibration or DistortionSolution
         What is exported.
     degree : int, optional
-        Degree, 1 to 7.  By default the lowest that comes within 1e-3 px everywhere, or else the
-        lowest that is nearly as good as any; without a table, the polynomial itself.
+        Degree, 1 to 7.  Default: the lowest that is accurate to 1e-3 px everywhere, or else the
+        lowest that is nearly as good as any.  Without a table, the polynomial itself is returned.
 
     Returns
     -------
     pv : PVPolynomial
-        In the matrix of the exposure.
+        Polynomial for the matrix of the exposure.
     deviation : float or None
         Largest deviation from the exact WCS, px; `None` if the shape of the detector is
         unknown.
@@ -176,7 +176,7 @@ def nearest_polynomial(obj, degree=None):
         try:
             pv = fold_polynomial(obj)
         except FileFormatError:
-            # Radial terms cannot be sheared; a polynomial comes near.
+            # Radial terms cannot be sheared, but a polynomial can approximate the result.
             require_shape(obj)
         else:
             return pv, None if image_shape_of(obj) is None else _tpv_deviation(obj, pv)
@@ -213,7 +213,7 @@ def refit(obj, degree):
     Returns
     -------
     again : Calibration or DistortionSolution
-        With the nodes of the table of ``obj``, or 50 along each axis.
+        The mapping in the new form, with the nodes of the table of ``obj`` or 50 along each axis.
     """
     exact = description(obj)
     ny, nx = require_shape(obj)
@@ -242,7 +242,7 @@ def _tpv_deviation(obj, pv, **options):
 
 
 def _swarp_deviation(obj, tpv, n=101):
-    """Greatest distance of SWarp's pixels from those of the exact WCS, px."""
+    """Greatest distance, in px, between the pixels of SWarp and those of the exact WCS."""
     exact = description(obj)
     ny, nx = image_shape_of(obj)
     x, y = np.meshgrid(np.linspace(-0.5, nx - 0.5, n), np.linspace(-0.5, ny - 0.5, n))

@@ -9,8 +9,8 @@ Everything is solved by QR and SVD of columns scaled to unit length, never by no
 raw powers.
 """
 
-# astropy imports the fitter (entry point ``astropy.modeling``) at the end of its own import, which
-# has to happen before the fitter's module begins, not in its midst.
+# astropy imports the fitter (entry point ``astropy.modeling``) at the end of its own import.  That
+# must happen before the fitter's module is executed, not halfway through it.
 import astropy.modeling  # noqa: F401
 
 from wpdc_gwcs.fitting.attitude import MIN_STARS_ATTITUDE, AttitudeFit, fit_attitude

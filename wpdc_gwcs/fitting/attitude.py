@@ -13,7 +13,7 @@ __all__ = ["MIN_STARS_ATTITUDE", "AttitudeFit", "fit_attitude"]
 
 @dataclass(frozen=True, eq=False)
 class AttitudeFit:
-    """Attitude of one exposure: where it points, and its linear scale and orientation.
+    """Attitude of one exposure: its pointing, scales and orientation.
 
     Parameters
     ----------
@@ -22,18 +22,18 @@ class AttitudeFit:
     cd : (2, 2) ndarray
         Linear matrix, deg / px.
     covariance : (6, 6) ndarray
-        Covariance of the errors (ax, bxx, bxy, ay, byx, byy) that the attitude leaves in the
-        undistorted position: dX = ax + bxx X + bxy Y and dY = ay + byx X + byy Y, with X, Y in px
-        from the reference point.
+        Covariance of (ax, bxx, bxy, ay, byx, byy), which describe the error of the attitude as an
+        error of the undistorted position: dX = ax + bxx X + bxy Y and dY = ay + byx X + byy Y, with
+        X, Y in px from the reference point.
     dx, dy : (N,) ndarray
-        Residuals X - X_ref, Y - Y_ref in undistorted px, of all stars given.
+        Residuals X - X_ref, Y - Y_ref of all given stars, in undistorted px.
     used : (N,) ndarray of bool
         Stars kept by the fit.
     scale : (2,) ndarray
-        Robust scatter of the kept residuals divided by their errors (of the residuals in px,
-        without errors).
+        Robust scatter of the residuals of the stars that were kept, divided by their errors; in px
+        if no errors were given.
     iterations : int
-        Iterations until CRVAL no longer moved.
+        Number of iterations until CRVAL no longer changed.
     """
 
     crval: np.ndarray
@@ -46,14 +46,14 @@ class AttitudeFit:
     iterations: int
 
 
-# Six numbers from fewer stars than this are at the mercy of a single wrong pair.
+# With fewer stars, a single wrong pair could spoil the six numbers.
 MIN_STARS_ATTITUDE = 10
 
 _MAX_ITERATIONS = 50
 
 
 def fit_attitude(x, y, ra, dec, *, crpix, crval, cd, x_err=None, y_err=None, clip=4.0, used=None):
-    """Fit CRVAL and CD of one exposure, six numbers, to all its stars with the instrument fixed.
+    """Fit the attitude of one exposure, CRVAL and CD, with the instrument fixed.
 
     Parameters
     ----------
@@ -68,12 +68,12 @@ def fit_attitude(x, y, ra, dec, *, crpix, crval, cd, x_err=None, y_err=None, cli
     cd : (2, 2) array_like
         Starting matrix, deg / px.
     x_err, y_err : (N,) array_like, optional
-        Total 1-sigma errors in px; equal weights if not given.
+        Total 1-sigma errors in px.  Default: equal weights.
     clip : float, optional
-        Stars with a residual of more than this many robust standard deviations in either axis are
-        left out, iterated.
+        Stars with a residual of more than this many robust standard deviations along either axis
+        are left out.  The fit is iterated.
     used : (N,) array_like of bool, optional
-        Stars that may be used.
+        Mask of the stars that may be used.  Default: all.
 
     Returns
     -------
@@ -83,14 +83,14 @@ def fit_attitude(x, y, ra, dec, *, crpix, crval, cd, x_err=None, y_err=None, cli
     Raises
     ------
     FitError
-        If fewer than ten stars remain, or they do not determine six numbers.
+        If fewer than ten stars remain, or if they do not determine the six numbers.
 
     Notes
     -----
-    The stars are projected about the current CRVAL, ``CD^-1 (xi, eta) = a + B (X, Y)`` is solved by
-    weighted least squares, CD becomes CD B and CRVAL the sky position of the reference point.  This
-    is repeated until CRVAL no longer changes, so that the fit is valid on the sphere for any dither
-    and close to the poles.
+    The stars are projected about the current CRVAL, and ``CD^-1 (xi, eta) = a + B (X, Y)`` is
+    solved by weighted least squares.  CD is replaced by CD B, and CRVAL by the sky position of the
+    reference point.  This is repeated until CRVAL no longer changes, so the fit is exact on the
+    sphere, for any dither and close to the poles.
 
     Examples
     --------
@@ -104,7 +104,7 @@ def fit_attitude(x, y, ra, dec, *, crpix, crval, cd, x_err=None, y_err=None, cli
     >>> bool(np.allclose(fit.crval, (120.0, 30.0), rtol=0, atol=1e-10))
     True
     """
-    # Not at module level: astropy imports this package in the midst of importing its modeling.
+    # Not at module level: astropy imports this package while it imports its own modeling.
     from wpdc_gwcs.models import deproject, project
 
     z = np.array([np.asarray(x, float) - crpix[0], np.asarray(y, float) - crpix[1]])
@@ -130,7 +130,7 @@ def fit_attitude(x, y, ra, dec, *, crpix, crval, cd, x_err=None, y_err=None, cli
         solution, covariance = _linear_attitude(
             z[:, kept], inverse @ plane[:, kept], sigma[:, kept]
         )
-        # The reference point's own place on the tangent plane becomes the new CRVAL.
+        # The position of the reference point on the tangent plane becomes the new CRVAL.
         shift = cd @ solution[:, 0]
         crval = np.array(deproject(*shift, crval))
         cd = cd @ solution[:, 1:]
@@ -147,7 +147,7 @@ def fit_attitude(x, y, ra, dec, *, crpix, crval, cd, x_err=None, y_err=None, cli
         settled = np.array_equal(keep, kept)
         kept = (
             keep if iteration < _MAX_ITERATIONS // 2 else kept
-        )  # a star on the limit may come and go
+        )  # a star at the limit may be in and out in turn
         if moved < 1e-9 and (settled or iteration >= _MAX_ITERATIONS // 2):
             break
     if not has_errors:
@@ -164,7 +164,7 @@ def _linear_attitude(z, target, sigma):
     unit = np.array([1.0, length, length])
     solution, covariance = np.empty((2, 3)), np.zeros((6, 6))
     for axis in range(2):
-        # Small numbers: the correction to the current attitude, not the position.
+        # The correction to the current attitude is a small number, the position is not.
         fit = solve_linear(rows, target[axis] - z[axis], sigma[axis] ** -2)
         solution[axis] = fit.parameters / unit
         root = fit.root / unit[:, None]

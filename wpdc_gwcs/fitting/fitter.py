@@ -23,34 +23,35 @@ class WPDCFitter(Fitter):
     Parameters
     ----------
     weight : RadialWeight, optional
-        Weight of a star by its distance from the reference point; uniform if not given.
+        Weight of a star by its distance from the reference point.  Default: uniform.
     pixel_scale : float or (2, 2) array_like, optional
         Size of a pixel in the unit of ``xi`` and ``eta``, or the CD matrix: the distance from the
-        reference point is ``hypot(CD^-1 (xi, eta))`` px.  Not needed for uniform weights or where
+        reference point is ``hypot(CD^-1 (xi, eta))`` px.  Not needed for uniform weights, or if
         ``distance`` is given with the data.
     robust : {None, 'clip', 'huber'}, optional
-        What happens to outliers: nothing, iterative clipping, or Huber weights.
+        Treatment of outliers: none, iterative clipping, or Huber weights.
     clip : float, optional
-        Limit in robust standard deviations (1.4826 times the median absolute residual) beyond which
-        a star is left out (``clip``) or its weight falls with its residual (``huber``).
+        Limit in robust standard deviations (1.4826 times the median absolute residual).  Beyond it,
+        a star is left out (``clip``), or its weight decreases with its residual (``huber``).
     damping : float, optional
-        Share of a correction that is applied before the stars are matched again, 0 to 1; only used
-        with ``rematch``.
+        Fraction of a correction that is applied before the stars are matched again, 0 to 1.  Only
+        used with ``rematch``.
     rematch : callable, optional
-        ``rematch(model)`` returns the data ``(xi, eta, xi_ref, eta_ref)`` or ``(xi, eta, xi_ref,
-        eta_ref, weights)`` matched anew with the corrected positions.  The result is the undamped
-        optimum of the last matches.
+        ``rematch(model)`` matches the stars again, with the corrected positions, and returns the
+        data ``(xi, eta, xi_ref, eta_ref)`` or ``(xi, eta, xi_ref, eta_ref, weights)``.  The result
+        is the undamped optimum of the last matches.
     max_iterations : int, optional
-        Greatest number of damped corrections, and of robust iterations of each solution.
+        Greatest number of damped corrections, and of robust iterations in each solution.
     calc_uncertainties : bool, optional
-        Attach ``cov_matrix`` and ``stds`` to the returned model, as astropy's fitters do.
+        Whether to attach ``cov_matrix`` and ``stds`` to the returned model, as the fitters of
+        astropy do.
 
     Attributes
     ----------
     fit_info : dict
-        Of the last call: ``covariance`` of the free parameters (with ``param_names``), ``rank``,
-        ``condition``, ``iterations`` (re-matchings), ``robust_iterations``, ``converged``,
-        ``n_used``, ``used`` (mask of the stars kept), ``rms`` and ``scatter`` of the residuals of
+        Results of the last call: ``covariance`` of the free parameters (with ``param_names``),
+        ``rank``, ``condition``, ``iterations`` (re-matchings), ``robust_iterations``,
+        ``converged``, ``n_used``, ``used`` (mask of the stars kept), ``rms`` and ``scatter`` of the residuals of
         each output, ``chi2``, ``residuals`` ``(2, N)``.
 
     Raises
@@ -119,7 +120,7 @@ class WPDCFitter(Fitter):
                     "pixel_scale must be a non-zero number or an invertible 2 x 2 matrix, got "
                     f"{pixel_scale}"
                 )
-        # The optimizer and statistic of the base class serve non-linear fits; there is none here.
+        # The optimizer and the statistic of the base class are for non-linear fits only.
         self.weight = weight
         self.pixel_scale = pixel_scale
         self.robust = robust
@@ -154,13 +155,13 @@ class WPDCFitter(Fitter):
         xi, eta : (N,) array_like
             Positions before the correction; usually deg.
         xi_ref, eta_ref : (N,) array_like
-            Positions of the reference, in the same unit.
+            Reference positions in the same unit.
         weights : float, (N,) or (2, N) array_like, optional
-            1/sigma of each star, or of each output and star.
+            1/sigma of each star, or of each output and star.  Default: 1.
         distance : (N,) array_like, optional
-            Distance from the reference point in px, instead of the one found with ``pixel_scale``.
+            Distance from the reference point in px.  Default: computed with ``pixel_scale``.
         inplace : bool, optional
-            Change the model given instead of a copy.
+            Whether to change the given model instead of a copy.
 
         Returns
         -------
@@ -170,7 +171,7 @@ class WPDCFitter(Fitter):
         Raises
         ------
         FitError
-            If the data hold NaN, are fewer than the free coefficients, or do not determine them.
+            If the data contain NaN, are fewer than the free coefficients, or do not determine them.
         ModelLinearityError
             If the model is not linear in its parameters.
         UnsupportedConstraintError
@@ -262,8 +263,8 @@ class WPDCFitter(Fitter):
             data, before = self._check_data(*self.rematch(model)), data
             if _same_matches(data, before):
                 break
-        # The damped model is still (1 - damping)^n of the way off; its matches need not be those of
-        # the optimum.
+        # The damped model is still off by a factor (1 - damping)^n of the initial error, so its
+        # matches may differ from those of the optimum.
         for undamped in range(1, self.max_iterations + 1):  # noqa: B007
             solution, _ = self._solve(model, free, data)
             model.parameters = solution
@@ -296,8 +297,8 @@ class WPDCFitter(Fitter):
             if self.robust is None:
                 break
             normalized = np.abs(residual * inverse_sigma)
-            # The scale is that of the stars the fit answers for: outside r0 the polynomial is an
-            # extrapolation.
+            # The scale is that of the stars that the fit represents: outside r0, the polynomial is
+            # an extrapolation.
             core = radial > 0.5 if np.sum(radial > 0.5) > free.sum() else radial > 0
             sigma = np.array(
                 [robust_sigma(a[core & (s > 0)]) for a, s in zip(normalized, inverse_sigma)]
@@ -386,7 +387,7 @@ def _linear_form(model, free, position):
         unit = base.copy()
         unit[index] = 1.0
         design[:, :, column] = evaluate(unit) - offset
-    # Linear or not: astropy's flag says no for every compound model, so ask the model itself.
+    # The flag of astropy says "not linear" for every compound model, so test the model itself.
     probe = base.copy()
     probe[free] = 1.0 + np.sqrt(2.0) * np.arange(1, n_free + 1)
     direct = evaluate(probe)
@@ -414,7 +415,7 @@ def _pv_columns(model, position, free):
 
 
 def _independent_outputs(design):
-    """Split the problem where no parameter acts on both outputs: two small QRs, not a large one."""
+    """Split the problem if no parameter acts on both outputs: two small QRs, not a large one."""
     acts = np.any(design != 0, axis=1)
     if np.any(acts[0] & acts[1]):
         return [(np.array([True, True]), np.ones(design.shape[2], bool))]

@@ -30,16 +30,16 @@ def solve_linear(design, target, weight=None, *, leverage=False):
     design : (N, p) ndarray
         Columns of the linear model.
     target : (N,) or (N, k) ndarray
-        Values to be reproduced; several right-hand sides share the factorization.
+        Values to fit; several right-hand sides share the factorization.
     weight : (N,) ndarray, optional
-        Weight of the squared residual.
+        Weights of the squared residuals.  Default: 1.
     leverage : bool, optional
-        Also return the diagonal of the hat matrix.
+        Whether to return the diagonal of the hat matrix as well.
 
     Returns
     -------
     LinearSolution
-        Parameters ``(p,)`` or ``(p, k)``; rank and condition number of the scaled, weighted
+        Parameters ``(p,)`` or ``(p, k)``, and the rank and condition number of the scaled, weighted
         columns.
 
     Raises
@@ -63,7 +63,7 @@ def solve_linear(design, target, weight=None, *, leverage=False):
             f"{int(np.sum(~(scale > 0)))} of {p} coefficients cannot be determined: "
             "their terms or the weights are zero at all stars"
         )
-    # QR first: the SVD is then of a small triangle, whatever the number of stars.
+    # After the QR, the SVD is that of a small triangle, for any number of stars.
     q, r = np.linalg.qr(design / scale)
     u, s, vt = np.linalg.svd(r)
     rank = int(np.sum(s > s[0] * p * np.finfo(float).eps))

@@ -8,7 +8,7 @@ import numpy as np
 __all__ = ["RadialWeight"]
 
 _WEIGHTS = ("exp-sqrt", "gaussian", "inverse", "inverse-square", "uniform")
-# As the paper numbers them.
+# The numbers of the paper.
 _NUMBERED = {f"w{k}": name for k, name in enumerate(_WEIGHTS[:4], 1)}
 
 
@@ -22,7 +22,7 @@ class RadialWeight:
         Weighting function outside ``r0``; inside, every weight is 1.  The paper's ``w1`` to ``w4``
         are the first four.
     r0 : float, optional
-        Radius in px within which all stars weigh the same.
+        Radius in px within which all stars have the same weight.
 
     Raises
     ------
@@ -42,8 +42,8 @@ class RadialWeight:
     ``uniform``         1
     ==================  ======================================
 
-    The weight multiplies the *squared* residual.  ``exp-sqrt`` falls to 5e-5 within 100 px: it is a
-    hard mask, and a polynomial fitted with it is an extrapolation outside ``r0``.
+    The weight multiplies the *squared* residual.  ``exp-sqrt`` falls to 5e-5 within 100 px, so it
+    acts as a mask: outside ``r0``, a polynomial fitted with it is an extrapolation.
 
     References
     ----------
@@ -72,7 +72,7 @@ class RadialWeight:
 
     @classmethod
     def for_shape(cls, image_shape, name="exp-sqrt"):
-        """Weight with the default radius of a detector: 0.87 times half its shorter side.
+        """Return a weight with the default radius of a detector: 0.87 times half its shorter side.
 
         Parameters
         ----------
@@ -84,7 +84,7 @@ class RadialWeight:
         Returns
         -------
         RadialWeight
-            With ``r0`` in px.
+            The weight, with ``r0`` in px.
         """
         return cls(name, r0=0.87 * 0.5 * min(image_shape))
 

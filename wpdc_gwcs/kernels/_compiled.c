@@ -1,9 +1,9 @@
-/* The kernels as a Python module: arguments in, interpreter lock off, blocks through.
+/* The kernels as a Python module: check arguments, release the interpreter lock, process blocks.
  *
- * Only the stable ABI and the buffer protocol are used, so that one build serves all later versions
- * of Python and of NumPy.  Callers hand over contiguous arrays of the right sizes
- * (wpdc_gwcs/kernels/plane.py, wpdc_gwcs/models/blocks.py); kinds and sizes are checked here all the
- * same, since a wrong one would crash.
+ * Only the stable ABI and the buffer protocol are used, so one build works with all later versions of
+ * Python and NumPy.  Callers pass contiguous arrays of the right sizes (wpdc_gwcs/kernels/plane.py,
+ * wpdc_gwcs/models/blocks.py).  Types and sizes are checked here nevertheless, because a wrong one
+ * would crash the program.
  */
 #define Py_LIMITED_API 0x030B0000
 #define PY_SSIZE_T_CLEAN
@@ -137,7 +137,7 @@ static void release(Buffers *held) {
     while (held->n) PyBuffer_Release(&held->views[--held->n]);
 }
 
-/* Return the memory of a contiguous array of one type, NULL with an exception set if it is none. */
+/* Return the memory of a contiguous array of one type, or NULL with an exception set. */
 static void *memory(Buffers *held, PyObject *object, char type, size_t width, int writable,
                     ptrdiff_t *size) {
     Py_buffer *view = &held->views[held->n];
@@ -151,7 +151,7 @@ static void *memory(Buffers *held, PyObject *object, char type, size_t width, in
         return NULL;
     }
     *size = view->len / (ptrdiff_t)width;
-    /* An array without elements need not be anywhere. */
+    /* An array without elements may have no memory. */
     return view->buf ? view->buf : view;
 }
 
@@ -229,7 +229,7 @@ static int count(Py_ssize_t given, Py_ssize_t wanted) {
     return -1;
 }
 
-/* Inputs x, y and outputs, all of one size; -1 with an exception set if they are not. */
+/* Size of the inputs x, y and the outputs, or -1 with an exception set if they differ. */
 static ptrdiff_t read_points(Buffers *held, PyObject *const *args, int n_outputs, double **arrays) {
     ptrdiff_t size;
     arrays[0] = numbers(held, args[0], 0, &size);

@@ -1,8 +1,8 @@
-/* Sine, cosine and arc tangent, in degrees, without branches: loops over them become vector code.
+/* Sine, cosine and arc tangent in degrees, without branches, so that loops over them are vectorized.
  *
  * The polynomials are those of fdlibm (Sun Microsystems, 1993: "Permission to use, copy, modify,
- * and distribute this software is freely granted, provided that this notice is preserved").  Errors
- * are below 4e-16 of the value.
+ * and distribute this software is freely granted, provided that this notice is preserved").
+ * Relative errors are below 4e-16.
  */
 #ifndef WPDC_ANGLES_H
 #define WPDC_ANGLES_H
@@ -12,12 +12,12 @@
 #define RADIAN 0.017453292519943295 /* degrees to radians */
 #define DEGREE 57.29577951308232    /* radians to degrees */
 
-/* Angles beyond it, degrees, are no coordinates. */
+/* Larger angles, in degrees, cannot be coordinates. */
 #define GREATEST_ANGLE 1e9
 
 INLINE void sin_cos(double angle, double *sine, double *cosine) {
     angle = fabs(angle) <= GREATEST_ANGLE ? angle : NAN;
-    /* Quarters of a turn are taken off in degrees, where they are exact. */
+    /* Quarter turns are subtracted in degrees, where they are exact. */
     double quarters = round_even(angle * (1.0 / 90.0));
     double x = (angle - quarters * 90.0) * RADIAN;
     double z = x * x;
@@ -46,7 +46,7 @@ INLINE void sin_cos(double angle, double *sine, double *cosine) {
 INLINE double arc_tangent(double y, double x) {
     double up = fabs(y);
     double along = fabs(x);
-    /* atan(y / x) is the arc tangent of a small number from one of a few angles. */
+    /* atan(y / x) is one of a few angles plus the arc tangent of a small number. */
     double numerator = up, denominator = along, base = 0.0, rest = 0.0;
     int far = up > 0.4375 * along;
     numerator = far ? 2.0 * up - along : numerator;
@@ -86,7 +86,7 @@ INLINE double arc_tangent(double y, double x) {
 /* Right ascension from -180 to 540 degrees into the range from 0 to 360. */
 INLINE double wrap(double ra) {
     ra += ra < 0.0 ? 360.0 : (ra >= 360.0 ? -360.0 : 0.0);
-    /* A tiny negative angle is rounded up to 360. */
+    /* A tiny negative angle was rounded up to 360. */
     return ra >= 360.0 ? 0.0 : ra;
 }
 

@@ -1,4 +1,4 @@
-/* The inverse of a map of the plane by Newton's method, with the gnomonic projection in front. */
+/* The inverse of a map of the plane by Newton's method, after an optional gnomonic projection. */
 #ifndef WPDC_INVERSE_H
 #define WPDC_INVERSE_H
 
@@ -10,10 +10,10 @@
 
 typedef struct {
     const Plane *plane;
-    const Plane *start; /* approximate inverse; NULL: the images themselves */
-    const Tangent *sky; /* NULL: images are given, not positions on the sky */
-    const Box *box;     /* NULL: answers anywhere */
-    double rim;         /* answers this far outside the box are put on its rim */
+    const Plane *start; /* approximate inverse; NULL: the given points themselves */
+    const Tangent *sky; /* NULL: points of the plane are given, not of the sky */
+    const Box *box;     /* NULL: results anywhere */
+    double rim;         /* results this close to the box are moved to its edge */
     double tolerance;   /* greatest residual */
     double curvature;   /* bound of the second derivatives inside the cells */
     double sign;        /* of the Jacobian determinant in the middle */
@@ -24,7 +24,7 @@ INLINE double hold(double v, double low, double high) {
     return v > high ? high : v;
 }
 
-/* Newton's method for n points from x, y on; what has no answer keeps the NaN of the outputs. */
+/* Newton's method for n points, starting at x, y; points without a solution stay NaN. */
 INLINE void solve_block(const Inverse *inverse, const double *a_given, const double *b_given,
                         const double *x_start, const double *y_start, const int *given, int n,
                         int bounded, double *x_out, double *y_out) {
@@ -53,7 +53,7 @@ INLINE void solve_block(const Inverse *inverse, const double *a_given, const dou
             x_new[k] = x[k] + dx;
             y_new[k] = y[k] + dy;
             determinant[k] = det * inverse->sign;
-            /* What a step leaves is bounded by its length. */
+            /* The length of the step bounds the residual that it leaves. */
             residual[k] = (dx * dx + dy * dy) * (0.5 * inverse->curvature);
         }
         int n_open = 0;
@@ -62,7 +62,7 @@ INLINE void solve_block(const Inverse *inverse, const double *a_given, const dou
             n_open += !((residual[k] <= inverse->tolerance) & in_cells(plane, x_new[k], y_new[k]));
         }
         if (n_open) {
-            /* The bound is not good enough, so the map itself has to say. */
+            /* The bound is too large, so evaluate the map itself. */
             for (int k = 0; k < n_open; k++) {
                 x_open[k] = x_new[open[k]];
                 y_open[k] = y_new[open[k]];
@@ -82,7 +82,7 @@ INLINE void solve_block(const Inverse *inverse, const double *a_given, const dou
         int n_left = 0;
         for (int k = 0; k < n; k++) {
             double size_a = fabs(a[k]), size_b = fabs(b[k]);
-            /* Rounding of the map sets the floor. */
+            /* Rounding errors of the map are the lower limit. */
             double limit = inverse->tolerance +
                            16.0 * DBL_EPSILON * (size_a < size_b ? size_b : size_a);
             if (residual[k] <= limit) {
@@ -92,7 +92,7 @@ INLINE void solve_block(const Inverse *inverse, const double *a_given, const dou
                 }
                 continue;
             }
-            /* A point that no longer moves, or left for infinity, has no answer. */
+            /* A point that no longer moves, or has gone to infinity, has no solution. */
             if ((x_new[k] == x[k] && y_new[k] == y[k]) || !isfinite(x_new[k]) ||
                 !isfinite(y_new[k]))
                 continue;
@@ -128,7 +128,7 @@ INLINE void invert_block(const Inverse *inverse, const double *restrict a_given,
         n_good += (isfinite(a[k]) != 0) & (isfinite(b[k]) != 0);
     }
     if (start && start->table) {
-        /* Held at the edge: what lies farther out has no answer anyway. */
+        /* Clipped to the edge: points farther out have no solution anyway. */
         for (ptrdiff_t k = 0; k < n; k++) {
             a_held[k] = hold(a[k], start->x_low, start->x_high);
             b_held[k] = hold(b[k], start->y_low, start->y_high);

@@ -7,7 +7,7 @@
 typedef struct {
     /* cells; none if the table is NULL */
     const double *table; /* [cell along y][cell along x][power of t][output][power of s] */
-    ptrdiff_t nx, ny;    /* without the outer ones */
+    ptrdiff_t nx, ny;    /* not counting the outer cells */
     double x_low, x_high, x_step, y_low, y_high, y_step;
     /* polynomial; none if NULL */
     const double *polynomial; /* [a, b, a_x, a_y, b_x, b_y][power of u][power of v] */
@@ -23,10 +23,10 @@ INLINE int in_cells(const Plane *p, double x, double y) {
     return (x >= p->x_low) & (x <= p->x_high) & (y >= p->y_low) & (y <= p->y_high);
 }
 
-/* Number of a cell, from 0 for the outer one, and the local coordinate, for one axis. */
+/* Number of the cell along one axis, 0 for the outer one, and the local coordinate in it. */
 INLINE double locate(double x, double low, double inverse, double n, double *local) {
     double s = (x - low) * inverse;
-    /* The outer cells take what is beyond, NaN stays NaN. */
+    /* Points farther out belong to the outer cells; NaN stays NaN. */
     double held = s < -1.0 ? -1.0 : s;
     held = held > n ? n : held;
     double number = round_even(held);
@@ -38,14 +38,14 @@ INLINE double locate(double x, double low, double inverse, double n, double *loc
 INLINE void locate_block(const Plane *plane, const double *restrict x, const double *restrict y,
                          ptrdiff_t n, double *restrict cell, double *restrict s,
                          double *restrict t) {
-    const Plane p = *plane; /* a copy, which no store can change */
+    const Plane p = *plane; /* a copy that no store can alias */
     const double x_inverse = 1.0 / p.x_step, y_inverse = 1.0 / p.y_step;
     const double nx = (double)p.nx, ny = (double)p.ny, width = (double)(p.nx + 2);
     for (ptrdiff_t k = 0; k < n; k++) {
         double i = locate(x[k], p.x_low, x_inverse, nx, s + k);
         double j = locate(y[k], p.y_low, y_inverse, ny, t + k);
         double number = j * width + i;
-        /* NaN is in no cell; its local coordinate is NaN in any. */
+        /* NaN is in no cell, but any will do: its local coordinate is NaN. */
         cell[k] = number >= 0.0 ? number : 0.0;
     }
 }
@@ -80,7 +80,7 @@ INLINE void jacobian_finish(double (*restrict rows)[16], const double *restrict 
     }
 }
 
-/* Values of the cells, added to a and b or written there. */
+/* Values of the cells, either added to a and b or stored there. */
 INLINE void cells_block(const Plane *p, const double *restrict x, const double *restrict y,
                         ptrdiff_t n, int add, double *restrict a, double *restrict b) {
     double cell[BLOCK], s[BLOCK], t[BLOCK], rows[BLOCK][8];
@@ -99,7 +99,7 @@ INLINE void cells_block(const Plane *p, const double *restrict x, const double *
         cells_finish(rows, s, n, 0, a, b);
 }
 
-/* One polynomial of the plane by Horner's rule, (u, v) of LANES points at a time. */
+/* One polynomial of the plane by Horner's rule, for LANES points at a time. */
 INLINE void horner(const double *restrict c, ptrdiff_t n, const double *restrict u,
                    const double *restrict v, double *restrict total) {
     for (int k = 0; k < LANES; k++) total[k] = c[(n - 1) * n];
@@ -113,14 +113,14 @@ INLINE void horner(const double *restrict c, ptrdiff_t n, const double *restrict
     }
 }
 
-/* All outputs of polynomial and radial terms: two values, or those and four derivatives. */
+/* All outputs of polynomial and radial terms: two values, optionally with four derivatives. */
 INLINE void polynomial_block(const Plane *p, const double *restrict x, const double *restrict y,
                              ptrdiff_t n, int n_outputs, double *const *outputs) {
     for (ptrdiff_t start = 0; start < n; start += LANES) {
         double u[LANES], v[LANES], total[6][LANES];
         const int lanes = n - start < LANES ? (int)(n - start) : LANES;
         for (int k = 0; k < LANES; k++) {
-            /* The last points fill up the lanes. */
+            /* If there are too few points, the first of them fills the other lanes. */
             ptrdiff_t at = k < lanes ? start + k : start;
             u[k] = x[at] - p->x0;
             v[k] = y[at] - p->y0;
@@ -141,7 +141,7 @@ INLINE void polynomial_block(const Plane *p, const double *restrict x, const dou
                 total[0][k] += terms[0];
                 total[1][k] += terms[1];
                 if (n_outputs > 2) {
-                    /* r has no derivative at 0; its one-sided slopes average to nothing there. */
+                    /* r has no derivative at 0, where its one-sided slopes average to zero. */
                     double inverse = r > 0.0 ? 1.0 / r : 0.0;
                     double r_x = (first * p->m00 + second * p->m10) * inverse;
                     double r_y = (first * p->m01 + second * p->m11) * inverse;

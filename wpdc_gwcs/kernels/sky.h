@@ -1,4 +1,4 @@
-/* Gnomonic projection behind and in front of a map of the plane. */
+/* Gnomonic projection, after and before a map of the plane. */
 #ifndef WPDC_SKY_H
 #define WPDC_SKY_H
 
@@ -8,7 +8,7 @@
 typedef struct {
     double ra0, sin0, cos0;      /* tangent point */
     double m00, m01, m10, m11;   /* from the plane in degrees ... */
-    double x0, y0;               /* ... to pixels, for the way back */
+    double x0, y0;               /* ... to pixels, for the inverse */
 } Tangent;
 
 typedef struct {
@@ -60,7 +60,8 @@ INLINE int all_in_box(const Box *limits, const double *restrict x, const double 
     return inside == n;
 }
 
-/* Detector to sky.  Where cells lead to the sky itself (plus RA0), they are used inside them. */
+/* Detector to sky.  If there are cells that map to the sky itself (plus RA0), points inside them use
+ * these. */
 INLINE void to_sky_block(const Plane *plane, const Plane *cells, const Tangent *g, const Box *box,
                          const double *restrict x, const double *restrict y, ptrdiff_t n,
                          double *restrict ra, double *restrict dec) {
@@ -99,12 +100,12 @@ INLINE void to_sky_block(const Plane *plane, const Plane *cells, const Tangent *
     }
 }
 
-/* Values of the cells along rows of an image: a[row][column], all columns of a tile at a time. */
+/* Values of the cells along the rows of an image, a[row][column], for all columns of a tile. */
 INLINE void cells_rows(const Plane *p, const double *restrict x, ptrdiff_t n_x,
                        const double *restrict y, ptrdiff_t n_y, ptrdiff_t stride,
                        double *restrict a, double *restrict b) {
     const double x_inverse = 1.0 / p->x_step, y_inverse = 1.0 / p->y_step;
-    /* What is left of the cells of a row of cells when s is given. */
+    /* Coefficients of a row of cells, after s has been inserted. */
     double c[4][2][BLOCK], s[BLOCK];
     ptrdiff_t column[BLOCK];
     for (ptrdiff_t k = 0; k < n_x; k++) {

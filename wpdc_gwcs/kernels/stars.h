@@ -1,7 +1,7 @@
 /* Stars: a point-spread function of cubic B-splines in pixels, and the normal equations of fits.
  *
- * See stars_in_numpy.py for what the arguments are.  Sums run in another order than there, so the
- * results agree to rounding, not to the bit.
+ * stars_in_numpy.py describes the arguments.  Sums are made in a different order there, so the results
+ * agree except for rounding.
  */
 #ifndef WPDC_STARS_H
 #define WPDC_STARS_H
@@ -14,7 +14,7 @@ typedef struct {
     const double *grids;     /* [component][row][column], zero outside */
     ptrdiff_t n_grids, size; /* number of components; rows and columns of each */
     ptrdiff_t oversampling;
-    /* work space: three times as many numbers as grid columns that the pixels of a row span */
+    /* work space: three numbers for each grid column that the pixels of a row span */
     double *line;
 } Spline;
 
@@ -29,7 +29,7 @@ typedef struct {
     const double *shares; /* of the components */
 } Phase;
 
-/* Add four rows of knots, each with its weight. */
+/* Add four rows of knots with their weights. */
 INLINE void add_rows(const double *const *rows, const double *weight, ptrdiff_t low,
                      ptrdiff_t high, double *restrict line) {
     const double *restrict a = rows[0], *restrict b = rows[1];
@@ -47,7 +47,7 @@ INLINE void star_row(const Spline *spline, const Phase *phase, ptrdiff_t row, pt
     const ptrdiff_t width = 2 * half + 1, n = columns_of(step, half);
     double *restrict line = spline->line, *restrict slope = line + n;
     for (ptrdiff_t c = 0; c < n; c++) line[c] = slope[c] = 0.0;
-    /* Beyond the grid there is nothing; so far out that integers end, neither. */
+    /* There is no light beyond the grid.  The test also excludes overflow of integers. */
     const double reach = (double)(size + n);
     if (fabs(phase->base_x) < reach && fabs(phase->base_y) < reach) {
         const ptrdiff_t first = (ptrdiff_t)phase->base_x - 1 - step * half;
@@ -58,7 +58,7 @@ INLINE void star_row(const Spline *spline, const Phase *phase, ptrdiff_t row, pt
             const double *knots[4];
             double weight[4], steep[4];
             for (ptrdiff_t q = 0; q < 4; q++) {
-                /* Rows beyond the grid count nothing; any other stands in for them. */
+                /* Rows beyond the grid have zero weight; any row can be read instead. */
                 const int there = top + q >= 0 && top + q < size;
                 knots[q] = spline->grids + (r * size + (there ? top + q : 0)) * size + first;
                 weight[q] = there ? phase->shares[r] * phase->taps_y[q] : 0.0;
@@ -80,7 +80,7 @@ INLINE void star_row(const Spline *spline, const Phase *phase, ptrdiff_t row, pt
     }
 }
 
-/* All pixels of one star; NaN throughout where its position is. */
+/* All pixels of one star; all NaN if its position is NaN. */
 INLINE void star_pixels(const Spline *spline, const Phase *phase, ptrdiff_t half, int gradient,
                         double *restrict value, double *restrict by_x, double *restrict by_y) {
     const ptrdiff_t width = 2 * half + 1;
@@ -95,7 +95,7 @@ INLINE void star_pixels(const Spline *spline, const Phase *phase, ptrdiff_t half
     }
 }
 
-/* Add one star to an image of float32. */
+/* Add one star to a float32 image. */
 INLINE void paint_star(const Spline *spline, const Phase *phase, double x, double y, double flux,
                        ptrdiff_t half, float *restrict image, ptrdiff_t ny, ptrdiff_t nx) {
     double *value = spline->line + 2 * columns_of(spline->oversampling, half);
@@ -115,7 +115,7 @@ typedef struct {
     double inverse_gain, mismatch;
 } NoiseNumbers;
 
-/* Gauss-Newton step of x, y and flux, its covariance and the reduced chi square of one star. */
+/* Gauss-Newton step of x, y and flux of one star, its covariance and its reduced chi square. */
 INLINE void star_step(const double *restrict value, const double *restrict by_x,
                       const double *restrict by_y, double flux, const double *restrict pixels,
                       const unsigned char *restrict use, const double *restrict variance,
@@ -144,7 +144,7 @@ INLINE void star_step(const double *restrict value, const double *restrict by_x,
         n_used++;
     }
     *chi2 = sum / (double)(n_used > 4 ? n_used - 3 : 1);
-    /* Scaled to a unit diagonal, so that "singular" has one meaning for all fluxes. */
+    /* Scaled to a unit diagonal, so that "singular" means the same for all fluxes. */
     const double sx = sqrt(xx), sy = sqrt(yy), sf = sqrt(ff);
     const int empty = !(sx > 0.0 && sy > 0.0 && sf > 0.0);
     const double a = xy / sx / sy, b = xf / sx / sf, c = yf / sy / sf;

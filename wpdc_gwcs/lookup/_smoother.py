@@ -1,7 +1,7 @@
 """Smooth surfaces through binned residuals.
 
-The numerics behind the table: kernels as in `scipy.interpolate.RBFInterpolator`, spectra for
-cross-validation, pilot surfaces for the curvature within bins.
+The numerical methods for the table: kernels as in `scipy.interpolate.RBFInterpolator`, spectra for
+cross-validation, and pilot surfaces for the curvature within bins.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _PILOT_NODES = 51
 
 @dataclass(frozen=True)
 class TableChoice:
-    """How a look-up table is interpolated from the bins.
+    """Settings for the interpolation of a look-up table from the bins.
 
     Parameters
     ----------
@@ -32,10 +32,10 @@ class TableChoice:
     degree : int
         Degree of the polynomial that the interpolator adds.
     smoothing : float
-        Smoothing of a bin divided by the variance of its mean (px^2); positions in units of half
-        the longer side.
+        Smoothing of a bin divided by the variance of its mean (px^2), for positions in units of
+        half the longer side.
     epsilon : float
-        Shape parameter of the kernel in the same unit; 1 for kernels without a scale.
+        Shape parameter of the kernel for positions in this unit; 1 for kernels without a scale.
     score : float
         Cross-validated mean square of the normalized residuals; NaN if not measured.
     freedom : float
@@ -108,7 +108,7 @@ class Pilot:
 
 
 def kernel_matrix(name, epsilon, u, v, u2, v2):
-    """Kernel matrix with the signs and scales of scipy's `RBFInterpolator`."""
+    """Kernel matrix with the signs and scales of `scipy.interpolate.RBFInterpolator`."""
     square = (epsilon * (u[:, None] - u2)) ** 2
     square += (epsilon * (v[:, None] - v2)) ** 2
     if name == "gaussian":
@@ -153,7 +153,7 @@ class Spectrum:
 
         k = kernel_matrix(kernel, epsilon, bins.u, bins.v, bins.u, bins.v)
         if kernel == "gaussian" and epsilon < _FULL_RANK_EPSILON:
-            # Long lengths have few modes: K = F F^T of low rank, and the Gram matrix of F is small.
+            # Kernels of long lengths have few modes: K = F F^T has low rank, and F^T F is small.
             factor = rotate(_low_rank(k) * root[:, None])[p:]
             squares, vectors = eigh(factor.T @ factor, overwrite_a=True, driver="evd")
             good = squares > 1e-14 * squares[-1]
@@ -174,7 +174,7 @@ class Spectrum:
         """Generalized cross-validation and effective parameters, one row per degree."""
         target = self._rotate(np.hstack([value * self._root[:, None], self._basis]))
         modes = self._vectors.T @ target
-        # What no mode reaches is all residual.
+        # The part that no mode represents is all residual.
         rest = target.T @ target - modes.T @ modes
         n_rest = len(target) - len(modes)
         g = smoothing[:, None] / (self.eigenvalues + smoothing[:, None])

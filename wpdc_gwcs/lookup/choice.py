@@ -32,25 +32,25 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 
-# Kernel, shape parameter and least degree of its polynomial.  The Gaussian of length l has
-# epsilon = 1 / (sqrt(2) l): from three times the detector to a thirteenth of it.
+# Kernel, shape parameter and least degree of its polynomial.  A Gaussian of length l has
+# epsilon = 1 / (sqrt(2) l); lengths go from three times the detector to a thirteenth of it.
 BROAD_KERNELS = tuple(("gaussian", epsilon, 1) for epsilon in (0.25, 0.5, 1.0, 2.0))
 OPEN_KERNELS = (("thin_plate_spline", 1.0, 1), ("gaussian", 4.0, 1))
 NARROW_KERNELS = tuple(("gaussian", epsilon, 1) for epsilon in (3.0, 5.0, 6.0, 7.5, 9.0))
 
-# Smoothings tried, in units of the largest eigenvalue: from following every bin to all but none.
+# Smoothings that are tried, in units of the largest eigenvalue: from almost none to almost flat.
 _SMOOTHINGS = 10.0 ** np.arange(-10.0, 3.01, 0.5)
 
-# Gain of generalized cross-validation at which kernels of short length are tried.
+# Gain in generalized cross-validation above which kernels of short length are tried.
 _NARROW_GAIN = 0.998
 
-# Candidates that go from generalized cross-validation on to cross-validation over exposures.
+# Candidates that generalized cross-validation passes on to cross-validation over exposures.
 _N_SHORTLIST = 4
 
-# Stars per bin below which bins are joined further for the choice of settings.
+# If bins have fewer stars than this, they are joined further for the choice of settings.
 _STARS_PER_BIN = 4
 
-# Fewer stars than this, or all of them in fewer bins, do not carry a table.
+# With fewer stars, or all of them in fewer bins, there is no table.
 MIN_STARS_TABLE = 60
 _MIN_BINS_TABLE = 20
 
@@ -75,26 +75,26 @@ def carries_table(residual_map):
 
 @one_blas_thread
 def choose_table(residual_map, *, lut="auto"):
-    """Kernel, degree and smoothing of a look-up table, chosen from the data.
+    """Choose kernel, degree and smoothing of a look-up table by cross-validation.
 
     Parameters
     ----------
     residual_map : ResidualMap
         Residuals of one detector.
     lut : {'auto', 'always'}, optional
-        ``auto`` allows the result that no table is best.
+        With ``auto``, having no table may turn out best.
 
     Returns
     -------
     choice : TableChoice
         The best settings, for `build_lookup_table`.
     candidates : tuple of TableChoice
-        All that were compared by cross-validation, best first.
+        All settings that were compared by cross-validation, best first.
 
     Raises
     ------
     FitError
-        If a table is asked for and the map holds too few stars.
+        If ``lut`` is ``always`` and the map has too few stars.
     """
     if not carries_table(residual_map):
         if lut == "always":
@@ -108,7 +108,7 @@ def choose_table(residual_map, *, lut="auto"):
 
 
 def join_bins(residual_map):
-    """Join bins into larger ones, on which settings are tried: a smoother on M bins costs M^3.
+    """Join bins into larger ones for the choice of settings: a smoother on M bins costs M^3.
 
     Parameters
     ----------
@@ -118,7 +118,8 @@ def join_bins(residual_map):
     Returns
     -------
     ResidualMap
-        The same in bins two to four times as large, with four stars each where there are enough.
+        The same residuals in bins two to four times as large, with at least four stars each if
+        there are enough.
     """
     my, mx = residual_map.shape
     factors = [k for k in (2, 3, 4) if my % k == 0 and mx % k == 0] or [1]
@@ -127,7 +128,7 @@ def join_bins(residual_map):
 
 
 def _choose(coarse, *, allow_none):
-    """Kernel, degree and smoothing by generalized cross-validation, then by groups of exposures."""
+    """Choose the settings by generalized cross-validation, then by groups of exposures."""
     bins = Bins(coarse)
     quintic = Spectrum(bins, "quintic", 1.0, 2)
     pilot = pilot_surface(bins, first_choice(bins, quintic))
@@ -141,8 +142,8 @@ def _choose(coarse, *, allow_none):
 
     broad = try_all(BROAD_KERNELS)
     narrow += try_all(OPEN_KERNELS)
-    # Splines and the medium length take structure of every size: where they are no better than the
-    # broad kernels there is none for the narrow ones.
+    # Splines and the medium length fit structure of every size.  If they are no better than the
+    # broad kernels, there is none that the narrow ones could fit.
     if min(c.score for c in narrow) < _NARROW_GAIN * min(c.score for c in broad):
         narrow += try_all(NARROW_KERNELS)
     found = broad + narrow
@@ -158,19 +159,19 @@ def _choose(coarse, *, allow_none):
 
 
 def first_choice(bins, spectrum=None):
-    """Choose reasonable settings at once: one kernel, generalized cross-validation.
+    """Choose reasonable settings fast: one kernel, generalized cross-validation.
 
     Parameters
     ----------
     bins : Bins
         Occupied bins.
     spectrum : Spectrum, optional
-        A kernel diagonalized on them; the quintic if not given.
+        A kernel diagonalized on the bins.  Default: the quintic.
 
     Returns
     -------
     TableChoice
-        Degree and smoothing of the least score.
+        Degree and smoothing with the least score.
     """
     if spectrum is None:
         spectrum = Spectrum(bins, "quintic", 1.0, 2)
@@ -178,18 +179,18 @@ def first_choice(bins, spectrum=None):
 
 
 def first_choices(residual_maps):
-    """Choose reasonable settings for several maps of the same stars at once.
+    """Choose reasonable settings for several maps of the same stars.
 
     Parameters
     ----------
     residual_maps : sequence of ResidualMap
-        Other residuals of the same stars in each.  Their bins, and so the kernel diagonalized on
-        them, which is what a choice costs, are common to all.
+        Maps of different residuals of the same stars.  They have the same bins, so the costly part,
+        to diagonalize the kernel on the bins, is done once.
 
     Returns
     -------
     list of TableChoice
-        What `first_choice` finds for each; no table where there are too few stars.
+        Result of `first_choice` for each map; no table if there are too few stars.
     """
     found, spectrum = [], None
     for residual_map in residual_maps:
@@ -224,7 +225,7 @@ def best_of(spectrum, value):
         d for d in range(spectrum.least_degree, MAX_DEGREE + 1) if 2 * n_terms(d) <= spectrum.n
     ]
     for degree, (score, freedom) in zip(degrees, spectrum.scores(value, smoothing, degrees)):
-        # A smoother that follows nearly every bin has no residuals to be judged by.
+        # A smoother that follows nearly every bin leaves no residuals to judge it by.
         score = np.where(freedom < 0.9 * spectrum.n, score, np.inf)
         k = int(np.argmin(score))
         found.append(
@@ -241,7 +242,7 @@ def best_of(spectrum, value):
 
 
 def _distinct(found):
-    """Keep the best few of different kernels or lengths: neighbors in degree hardly differ."""
+    """Keep the best few, of different kernels or lengths: neighbors in degree hardly differ."""
     kept = {}
     for c in found:
         kept.setdefault((c.kernel, c.epsilon), c)
@@ -249,12 +250,12 @@ def _distinct(found):
 
 
 def _cross_validate(coarse, candidates, pilot):
-    """Mean square normalized residual of left-out groups for each candidate."""
+    """Mean square of the normalized residuals of left-out groups, for each candidate."""
     folds = coarse.folds
     total = np.zeros(len(candidates))
     if len(folds) < 2:
-        # One group alone: generalized cross-validation has the last word, and no table is judged by
-        # the raw means.
+        # With a single group, generalized cross-validation decides, and having no table is judged
+        # by the raw means.
         bins = Bins(coarse)
         raw = np.sum(bins.value**2 * bins.weight[:, None]) / (2 * len(bins))
         return np.array([raw if c.kernel == "none" else c.score for c in candidates])

@@ -7,7 +7,7 @@ from wpdc_gwcs.detector import on_detector
 __all__ = ["N_FOLDS", "ResidualMap"]
 
 
-# Sums kept in every bin; w = 1 / sigma^2 with sigma^2 the mean of both axes.
+# Sums that every bin keeps; w = 1 / sigma^2, where sigma^2 is the mean of both axes.
 _SUMS = (
     "n", "w", "wx", "wy", "wxx", "wxy", "wyy",
     "wdx", "wdy", "wdxdx", "wdxdy", "wdydy", "wwvx", "wwvy",
@@ -16,10 +16,10 @@ _SUMS = (
 # Bins along the longer side of the detector; 128 px for the paper's 9216.
 _BINS = 72
 
-# Bins are made in multiples of this number, so that they can be joined by 2, 3 or 4.
+# Numbers of bins are multiples of this, so that 2, 3 or 4 bins can be joined.
 _BLOCK = 12
 
-# Groups of exposures (or of stars, for one exposure) that cross-validation leaves out in turn.
+# Number of groups of exposures (for one exposure, of stars) that cross-validation leaves out.
 N_FOLDS = 5
 
 
@@ -31,16 +31,16 @@ class ResidualMap:
     image_shape : (int, int)
         Shape ``(ny, nx)`` of the detector in px.
     sums : (K, 14, my, mx) ndarray, optional
-        Sums of an existing map, in the order of `ResidualMap.columns`; empty if not given.
+        Sums of an existing map, in the order of `ResidualMap.columns`.  Default: an empty map.
     shape : (int, int), optional
-        Bins ``(my, mx)``; about 72 along the longer side, in multiples of 12, if not given.
+        Bins ``(my, mx)``.  Default: about 72 along the longer side, in multiples of 12.
 
     Notes
     -----
-    Each bin holds the count, the weights, the weighted moments of position up to the second and of
-    the residuals up to the second, and the variance of the mean; separately for K = 5 groups of
-    exposures, which cross-validation leaves out in turn.  Maps of the same geometry add up, in any
-    order and grouping.
+    Each bin has the number of stars, the sum of weights, the weighted first and second moments of
+    the positions and of the residuals, and the variance of the mean.  They are kept separately for
+    K = 5 groups of exposures, which cross-validation leaves out in turn.  Maps of the same geometry
+    can be added in any order and grouping.
 
     Examples
     --------
@@ -77,7 +77,7 @@ class ResidualMap:
 
     @classmethod
     def from_residuals(cls, x, y, dx, dy, *, x_err, y_err, image_shape, fold=0, shape=None):
-        """Map of the residuals of one frame.
+        """Make the map of the residuals of one frame.
 
         Parameters
         ----------
@@ -90,14 +90,15 @@ class ResidualMap:
         image_shape : (int, int)
             Shape ``(ny, nx)`` of the detector.
         fold : int or (N,) array_like of int, optional
-            Group of the exposure (or of each star) in cross-validation; any integer.
+            Group of the exposure, or of each star, in cross-validation; any integer.
         shape : (int, int), optional
             Bins ``(my, mx)``.
 
         Returns
         -------
         ResidualMap
-            Stars off the detector, or with NaN or non-positive errors, are left out.
+            The map, without stars that are off the detector, have NaN, or errors that are not
+            positive.
         """
         self = cls(image_shape, shape=shape)
         ny, nx = self.image_shape
@@ -116,8 +117,8 @@ class ResidualMap:
         ix = np.minimum(((x + 0.5) * (mx / nx)).astype(int), mx - 1)
         iy = np.minimum(((y + 0.5) * (my / ny)).astype(int), my - 1)
         index = ((fold.astype(int) % N_FOLDS) * my + iy) * mx + ix
-        # Moments of position about the bin's center, or the second ones would be differences of
-        # large numbers.
+        # Moments of position are about the center of the bin: second moments about a distant point
+        # would be differences of large numbers.
         u = x - ((ix + 0.5) * (nx / mx) - 0.5)
         v = y - ((iy + 0.5) * (ny / my) - 0.5)
         w = 1.0 / variance
@@ -136,7 +137,7 @@ class ResidualMap:
             return NotImplemented
         if (self.image_shape, self.shape) != (other.image_shape, other.shape):
             raise ValueError(
-                f"residual maps must be of one geometry: detector {self.image_shape} in "
+                f"residual maps must have the same geometry: detector {self.image_shape} in "
                 f"{self.shape} bins "
                 f"and {other.image_shape} in {other.shape}"
             )
@@ -159,17 +160,17 @@ class ResidualMap:
 
     @property
     def n_stars(self):
-        """Stars in the map."""
+        """Number of stars in the map."""
         return int(round(self.sums[:, 0].sum()))
 
     @property
     def counts(self):
-        """Stars in every bin ``(my, mx)``."""
+        """Number of stars in every bin, ``(my, mx)``."""
         return self.sums[:, 0].sum(0)
 
     @property
     def folds(self):
-        """Groups that hold stars."""
+        """Groups that have stars."""
         return np.flatnonzero(self.sums[:, 0].sum((1, 2)) > 0)
 
     @property

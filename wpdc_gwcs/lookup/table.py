@@ -24,57 +24,54 @@ __all__ = ["TableInfo", "build_lookup_table"]
 def build_lookup_table(
     residual_map, n_grid=50, *, choice=None, lut="auto", method="cubic", draft=False
 ):
-    """Look-up table from binned residuals, with kernel, degree and smoothing chosen from the data.
+    """Build a look-up table from binned residuals, with settings chosen from the data.
 
     Parameters
     ----------
     residual_map : ResidualMap or sequence of ResidualMap
-        Residuals of one detector.  Maps of single exposures are put into groups for
-        cross-validation in turn.
+        Residuals of one detector.  Of several maps, one for each exposure, each goes into the next
+        group of the cross-validation.
     n_grid : int, optional
         Nodes of the table along each axis.
     choice : TableChoice, optional
-        Settings to use; chosen by cross-validation if not given.
+        Settings to use.  Default: chosen by cross-validation.
     lut : {'auto', 'always', 'none'}, optional
-        ``auto``: no table where none predicts left-out exposures at least as well; ``always``: the
-        best table; ``none``: no table.
+        ``auto``: the best table, unless left-out exposures are predicted as well without one;
+        ``always``: the best table; ``none``: no table.
     method : {'cubic', 'linear'}, optional
-        How the table interpolates between its nodes.
+        Interpolation of the table between its nodes.
     draft : bool, optional
-        Interpolate larger bins, without uncertainty and with settings that only one kernel
-        was tried for: a small part of the time, for iterations.
+        Whether to save time in iterations: larger bins, a single kernel, and no uncertainty.
 
     Returns
     -------
     table : LookupTable or None
-        Displacements to subtract, on nodes from one outer edge of the detector to the other; `None`
-        for no table.
+        Displacements to subtract, px, on nodes from one outer edge of the detector to the other;
+        `None` for no table.
     info : TableInfo
-        The choice made, all candidates with their scores, and the uncertainty of the table at the
-        nodes.
+        The settings used, all candidates with their scores, and the uncertainty at the nodes.
 
     Raises
     ------
     FitError
-        If a table is asked for and the map holds too few stars or bins.
+        If ``lut`` is ``always`` and the map has too few stars or bins, or if there is no map.
 
     Notes
     -----
-    1. Bins are represented by their inverse-variance means at their weighted centroids.  A mean
-       over a bin is not the value at its centroid: half the trace of Hessian times second moments
-       is taken off, with a pilot surface.
-    2. On larger bins, every kernel and length is diagonalized once, so that generalized
-       cross-validation over all smoothings (thirteen decades) and polynomial degrees costs next to
-       nothing.
-    3. The best few, and no table at all, are compared by leaving out one group of exposures after
-       the other.
-    4. The winner is interpolated on the fine bins by `scipy.interpolate.RBFInterpolator`, with
-       smoothing proportional to the variance of each bin, and the nodes are those whose spline
-       comes closest to it.
+    1. Each bin is represented by its inverse-variance mean at its weighted centroid.  The mean over
+       a bin differs from the value at its centroid by half the trace of the Hessian times the
+       second moments; a pilot surface provides the Hessian, and the difference is subtracted.
+    2. On larger bins, each kernel and length is diagonalized once.  Generalized cross-validation
+       over all smoothings (thirteen decades) and polynomial degrees then costs almost nothing.
+    3. The best few settings, and no table at all, are compared by leaving out one group of
+       exposures at a time.
+    4. `scipy.interpolate.RBFInterpolator` interpolates the fine bins with the best settings and a
+       smoothing proportional to the variance of each bin.  The nodes are those whose spline is
+       closest to this surface.
 
-    The same smoother is the posterior mean of a Gaussian process whose covariance is the kernel
-    divided by the smoothing; its posterior covariance, without the linear part that the attitudes
-    carry, is the uncertainty at the nodes.
+    The smoother is also the posterior mean of a Gaussian process whose covariance is the kernel
+    divided by the smoothing.  The posterior covariance of this process, without the linear part
+    that belongs to the attitudes, is the uncertainty at the nodes.
 
     References
     ----------
@@ -132,19 +129,19 @@ def build_lookup_table(
 
 @dataclass(frozen=True, eq=False)
 class TableInfo:
-    """How a look-up table was made.
+    """Settings, scores and uncertainty of a look-up table.
 
     Parameters
     ----------
     choice : TableChoice
         Settings used.
     candidates : tuple of TableChoice
-        All that were compared by cross-validation, best first.
+        All settings that were compared by cross-validation, best first.
     sigma : (3, n, n) ndarray or None
-        sigma_x and sigma_y in px and their correlation at the nodes.
+        sigma_x and sigma_y in px, and their correlation, at the nodes; `None` for a draft.
     chi2 : float
-        Reduced chi square of the bins about the table; near 1 if the errors of the stars are
-        correct.
+        Reduced chi square of the bins about the table, which is near 1 if the errors of the stars
+        are correct.
     """
 
     choice: TableChoice
@@ -154,7 +151,7 @@ class TableInfo:
 
 
 def _assign_folds(maps):
-    """Sum of maps, each put into one group of the cross-validation in turn."""
+    """Sum of maps, each of which goes into the next group of the cross-validation."""
     maps = list(maps)
     if not maps:
         raise FitError("no residual map was given")
@@ -187,7 +184,7 @@ def _fit_nodes(surface, bins, x_grid, y_grid):
     fine = [np.linspace(g[0], g[-1], 2 * len(g) - 1) for g in grids]
     u, v = np.meshgrid(*fine)
     sampled = surface(u.ravel(), v.ravel()).reshape(*u.shape, 2)
-    # The spline is linear in its nodes: one pseudo-inverse per axis.
+    # The spline is linear in its nodes, so one pseudo-inverse per axis suffices.
     inverse = [np.linalg.pinv(CubicSpline(g, np.eye(len(g)))(f)) for g, f in zip(grids, fine)]
     nodes = np.einsum("ia,jb,abk->kij", inverse[1], inverse[0], sampled, optimize=True)
     return nodes

@@ -1,4 +1,4 @@
-"""The literal WPDC-2P, as the paper has it: ``method="paper"``.
+"""WPDC-2P exactly as published: ``method="paper"``.
 
 ::
 
@@ -6,7 +6,7 @@
             ten steps of 50 %, matched again after each--> PV polynomials, residuals
     residuals of all exposures of a detector --raw RBF--> 50 x 50 nodes from 0 to n, bilinear
 
-It is here to be compared with: `wpdc_gwcs.solve` is what the package does by default.
+It is for comparison.  By default, the package uses `wpdc_gwcs.solve`.
 """
 
 from wpdc_gwcs.paper.polynomial import DAMPING, MAX_STEPS, ExposurePolynomial, fit_exposure

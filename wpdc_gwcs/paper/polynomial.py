@@ -1,4 +1,4 @@
-"""Phase 1 as the paper has it: the weighted polynomial of one exposure, in damped steps."""
+"""Phase 1 as in the paper: the weighted polynomial of one exposure, in damped steps."""
 
 from dataclasses import dataclass
 
@@ -11,28 +11,28 @@ from wpdc_gwcs.solve import Exposure
 
 __all__ = ["DAMPING", "MAX_STEPS", "ExposurePolynomial", "fit_exposure"]
 
-#: Share of each correction that is applied, and the largest number of steps: the paper's.
+#: Fraction of each correction that is applied, and largest number of steps, as in the paper.
 DAMPING, MAX_STEPS = 0.5, 10
-# "Until the positional residuals converge": positions that move by less, px rms, are at rest.
+# "Until the positional residuals converge": positions have moved by less than this, px rms.
 _AT_REST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class ExposurePolynomial:
-    """The polynomial of one exposure, about the tangent point of its header.
+    """Polynomial of one exposure, about the tangent point of its header.
 
     Parameters
     ----------
     exposure : Exposure
-        With its pairs as they were matched last.
+        The exposure, with its pairs from the last match.
     crpix : (2,) ndarray
         Reference point, px, zero based.
     pv : PVPolynomial
-        Polynomial in the matrix of the header, with constants and linear terms.
+        Polynomial for the matrix of the header, with constant and linear terms.
     covariance : (n, n) ndarray
-        Of its coefficients, those of both axes one after the other.
+        Covariance of its coefficients, first those of x, then those of y.
     steps : int
-        Damped steps.
+        Number of damped steps.
     """
 
     exposure: Exposure
@@ -42,7 +42,7 @@ class ExposurePolynomial:
     steps: int
 
     def correct(self, x, y):
-        """Take the polynomial's part of the distortion off.
+        """Remove the distortion that the polynomial describes.
 
         Parameters
         ----------
@@ -57,12 +57,12 @@ class ExposurePolynomial:
         return _corrected(self.pv, self.exposure.cd, self.crpix, x, y)
 
     def residuals(self):
-        """Residuals of the pairs, X' - X_ref and Y' - Y_ref.
+        """Compute the residuals of the pairs, X' - X_ref and Y' - Y_ref.
 
         Returns
         -------
         (2, N) ndarray
-            In px; NaN where a position is.
+            Residuals, px; NaN where a position is NaN.
         """
         return self.correct(self.exposure.x, self.exposure.y) - _reference(
             self.exposure, self.crpix
@@ -70,11 +70,11 @@ class ExposurePolynomial:
 
     @property
     def used(self):
-        """Pairs used in the fit: allowed and finite."""
+        """Mask of the pairs used in the fit: allowed and finite."""
         return _usable(self.exposure)
 
     def variance(self, x, y):
-        """Variance of the corrected position by the scatter of the stars in the fit.
+        """Compute the covariance of corrected positions from the scatter of the stars in the fit.
 
         Parameters
         ----------
@@ -107,26 +107,26 @@ def fit_exposure(exposure, crpix, *, weight, degree=3, rematch=None):
     weight : RadialWeight
         Weight of a star by its distance from the reference point.
     degree : int, optional
-        Degree of the polynomial, 1 to 7; the paper's is 3.
+        Degree of the polynomial, 1 to 7; 3 in the paper.
     rematch : callable, optional
-        ``rematch(correct)`` returns an `Exposure` with the pairs as they are matched anew, where
-        ``correct(x, y)`` gives corrected positions; the pairs stay as they are without it.
+        ``rematch(correct)`` matches the stars again and returns an `Exposure` with the new pairs,
+        where ``correct(x, y)`` returns corrected positions.  Default: the pairs do not change.
 
     Returns
     -------
     ExposurePolynomial
-        As the last step leaves it.
+        The polynomial after the last step.
 
     Raises
     ------
     FitError
-        If the stars within ``r0`` are too few, or do not determine the polynomial.
+        If there are too few stars within ``r0``, or if they do not determine the polynomial.
 
     Notes
     -----
-    Starting from the identity, each step adds half of what a weighted least-squares fit says is
-    missing: after ten of them 1/1024 of the distortion is left, 0.2 px of 200 px.  Errors of the
-    positions have no part in it.
+    Starting from the identity, each step adds half of the correction that a weighted least-squares
+    fit finds.  After ten steps, 1/1024 of the distortion is left: 0.2 px of 200 px.  The errors of
+    the positions are not used.
 
     References
     ----------
@@ -166,7 +166,7 @@ def fit_exposure(exposure, crpix, *, weight, degree=3, rematch=None):
 
 @dataclass(frozen=True, eq=False)
 class _Correction:
-    """Corrected positions by a polynomial, as a function."""
+    """Return the correction by a polynomial as a function of positions."""
 
     pv: PVPolynomial
     cd: np.ndarray

@@ -1,4 +1,4 @@
-"""The paper's solution of a group of exposures: polynomials, tables, and how sure they are."""
+"""The solution of the paper for a group of exposures: polynomials, tables, uncertainties."""
 
 import logging
 
@@ -32,7 +32,7 @@ def solve_literally(
     solution=None,
     rematch=None,
 ):
-    """Solve exposures as the paper does: each by its own polynomial, a raw table per detector.
+    """Solve exposures as in the paper: a polynomial for each, and a raw table per detector.
 
     Parameters
     ----------
@@ -45,24 +45,24 @@ def solve_literally(
     weight : dict
         `RadialWeight` of each detector.
     degree : int, optional
-        Degree of the polynomials, 1 to 7; the paper's is 3.
+        Degree of the polynomials, 1 to 7; 3 in the paper.
     n_grid : int, optional
-        Nodes of the table along each axis; the paper's are 50.
+        Nodes of the table along each axis; 50 in the paper.
     lut : {'auto', 'none'}, optional
-        The paper's table, or polynomials alone.
+        The table of the paper, or polynomials alone.
     solution : dict, optional
         Stored solutions by detector, whose tables are used as they are.
     rematch : callable, optional
-        ``rematch(k, correct)`` gives exposure ``k`` with the pairs that are matched anew with
-        corrected positions, see `fit_exposure`.
+        ``rematch(k, correct)`` matches exposure ``k`` again with corrected positions and returns
+        it, see `fit_exposure`.
 
     Returns
     -------
     result : SolveResult
-        The solution of a detector holds its table, and the mean of the polynomials without their
-        linear parts; each exposure has its own polynomial in ``pv`` about ``crpix``.
+        The solution of a detector has its table, and the mean of the polynomials without their
+        linear parts.  Each exposure has its own polynomial ``pv`` about ``crpix``.
     exposures : list of Exposure
-        With the pairs of the last step.
+        The exposures with the pairs of the last step.
 
     Raises
     ------
@@ -71,11 +71,11 @@ def solve_literally(
 
     Notes
     -----
-    ``sigma`` of an exposure is the formal error of its polynomial, extrapolated, and the scatter of
-    neighboring residuals, which a table through raw residuals takes over; that scatter holds what
-    the polynomials of the other exposures differ by.  It holds neither the share of the distortion
-    that the damped steps leave, where that differs between exposures, nor what straight lines
-    between the nodes miss, nor places beyond the outermost stars.
+    ``sigma`` of an exposure combines the extrapolated formal error of its polynomial with the
+    scatter of neighboring residuals, which is also the noise of a table through raw residuals.  The scatter
+    includes the differences between the polynomials of the exposures.  ``sigma`` does not include
+    the distortion that the damped steps leave, if it differs between exposures, the error of linear
+    interpolation between nodes, or extrapolation beyond the outermost stars.
 
     References
     ----------
@@ -135,7 +135,7 @@ def solve_literally(
 
 
 def _detector(name, polynomials, stars, table, image_shape, n_grid, settings):
-    """Return what the exposures of a detector have in common: the table and the mean polynomial."""
+    """Return what the exposures of a detector share: the table and the mean polynomial."""
     first = polynomials[0]
     crpix, degree = first.crpix, settings["degree"]
     ny, nx = image_shape
@@ -143,7 +143,7 @@ def _detector(name, polynomials, stars, table, image_shape, n_grid, settings):
     offset = np.array([x, y]) - crpix[:, None]
     cd, mean = None, 0.0
     for one in polynomials:
-        # In the matrix of the exposure about the common point; a polynomial stays one.
+        # A polynomial remains one for the matrix of the exposure, about the common point.
         one_cd = np.asarray(one.exposure.cd)
         plane = one_cd @ (one.correct(x, y) - crpix[:, None])
         pv = WPDCFitter()(PVPolynomial(degree), *(one_cd @ offset), *plane)
@@ -180,7 +180,7 @@ def _detector(name, polynomials, stars, table, image_shape, n_grid, settings):
 
 
 def _exposure_fit(one, solution, stored, stars, share, lut):
-    """Put together the result of one exposure."""
+    """Assemble the result of one exposure."""
     exposure = one.exposure
     residual = one.residuals()
     ny, nx = solution.image_shape
@@ -188,14 +188,14 @@ def _exposure_fit(one, solution, stored, stars, share, lut):
     x, y = (a.ravel() for a in grid)
     covariance = one.variance(x, y)
     if lut == "none" or solution.lookup_table is None:
-        # What the polynomial leaves is all that is wrong, and is to be seen.
+        # The error is all that the polynomial leaves, and it must show.
         covariance = covariance + _left(stars, x, y)
     else:
         finite = np.isfinite(residual).all(axis=0)
         at = np.array([exposure.x, exposure.y], float)[:, finite]
         residual = residual.copy()
         residual[:, finite] -= np.array(solution.lookup_table(*at))
-        # Its own stars carry the error of its polynomial into the table, which takes it off again.
+        # The table has the error of this polynomial, from its own stars, and subtracts it again.
         known = 0.0 if stored is not None else share
         covariance = (1.0 - known) * covariance + np.nan_to_num(solution.covariance(x, y))
     used = one.used
@@ -226,7 +226,7 @@ def _exposure_fit(one, solution, stored, stars, share, lut):
     )
 
 
-# Stars around a point whose mean residual tells what a polynomial leaves there.
+# Number of stars around a point whose mean residual shows what a polynomial leaves there.
 _LEFT_NEIGHBORS = 15
 
 
@@ -245,7 +245,7 @@ def _diagonal(variance):
 
 
 def _rejected(exposure, reason):
-    """Return an exposure that could not be solved back as it was."""
+    """Return an exposure that could not be solved, unchanged."""
     n = len(exposure.x)
     nothing = np.full(n, np.nan)
     return ExposureFit(

@@ -1,4 +1,4 @@
-"""Phase 2 as the paper has it: raw residuals, interpolated onto the nodes of a bilinear table."""
+"""Phase 2 as in the paper: raw residuals, interpolated onto the nodes of a bilinear table."""
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
@@ -10,17 +10,17 @@ from wpdc_gwcs.robust import robust_sigma
 
 __all__ = ["build_raw_table", "raw_noise"]
 
-# The paper names `RBFInterpolator` and no options.  One matrix of all stars, which is its default,
-# takes n^2 numbers and n^3 steps: 130 MB and some seconds for so many, 170 GB for the paper's 25
-# fields.  Beyond, as many neighbors as are known to make no difference (20 and 100 give the same
-# table to 1 % of its error).
+# The paper names `RBFInterpolator` and no options.  Its default, one matrix of all n stars, takes
+# n^2 numbers and n^3 steps: 130 MB and some seconds for this number, 170 GB for the 25 fields of the
+# paper.  For more stars, only so many neighbors are used; 20 and 100 neighbors give the same table
+# to 1 % of its error.
 _MOST_TOGETHER, _NEIGHBORS = 4000, 50
-# Stars around a point that tell the scatter there.
+# Number of stars around a point from which the scatter is computed.
 _NOISE_NEIGHBORS = 50
 
 
 def build_raw_table(x, y, dx, dy, *, image_shape, n_grid=50):
-    """Interpolate raw residuals onto the nodes of a look-up table, as the paper does.
+    """Interpolate raw residuals onto the nodes of a look-up table, as in the paper.
 
     Parameters
     ----------
@@ -31,12 +31,12 @@ def build_raw_table(x, y, dx, dy, *, image_shape, n_grid=50):
     image_shape : (int, int)
         Shape of the detector, ``(ny, nx)``.
     n_grid : int, optional
-        Nodes along each axis; the paper's are 50.
+        Nodes along each axis; 50 in the paper.
 
     Returns
     -------
     LookupTable
-        Bilinear between nodes from 0 to n.
+        Table that is bilinear between nodes from 0 to n.
 
     Raises
     ------
@@ -45,10 +45,10 @@ def build_raw_table(x, y, dx, dy, *, image_shape, n_grid=50):
 
     Notes
     -----
-    `scipy.interpolate.RBFInterpolator` with its defaults: a thin-plate spline through every
-    residual, without smoothing and whatever their errors are, so that a node has the noise of the
-    stars next to it.  Of more than 4000 stars the nearest 50 of each node are used, in place of a
-    matrix of all.  Stars at the very same pixel become one, with their mean.
+    `scipy.interpolate.RBFInterpolator` is used with its defaults: a thin-plate spline through every
+    residual, without smoothing and regardless of errors, so a node has the noise of the stars next
+    to it.  For more than 4000 stars, only the 50 nearest ones are used for each node.  Stars at the
+    same position are averaged.
 
     References
     ----------
@@ -84,7 +84,7 @@ def build_raw_table(x, y, dx, dy, *, image_shape, n_grid=50):
 
 
 def raw_noise(x, y, dx, dy, at_x, at_y):
-    """Scatter of the residuals of neighboring stars: the noise of a table that goes through them.
+    """Compute the scatter of neighboring residuals: the noise of a table that goes through them.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def raw_noise(x, y, dx, dy, at_x, at_y):
     dx, dy : (N,) array_like
         Their residuals, px.
     at_x, at_y : (M,) array_like
-        Where the scatter is asked for, px.
+        Positions for which the scatter is computed, px.
 
     Returns
     -------
