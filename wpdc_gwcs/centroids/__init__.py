@@ -1,4 +1,4 @@
-"""Positions by effective-PSF fitting: the PSF from the frame's own stars, then all sources at once.
+"""Positions by effective-PSF fitting: the PSF from the stars of the frame, then all sources.
 
 ::
 

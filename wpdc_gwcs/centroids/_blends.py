@@ -1,4 +1,4 @@
-"""What other stars do to a fit: those beside it, and those that hide under it."""
+"""Effects of other stars on a fit: neighbors, and hidden companions."""
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -10,54 +10,55 @@ from wpdc_gwcs.centroids._modes import blur_modes, companions, odd_modes, reduce
 
 __all__ = ["judge_profiles", "weigh_neighbors"]
 
-# Stars at a time: bounds the memory for their pixels.
+# Number of stars processed at a time, which limits the memory for their pixels.
 _CHUNK = 4000
 
-# Companions looked for, in magnitudes fainter than the star; and the logarithm of the odds, all of
-# them against none, that one single star in a hundred exceeds by noise.  Where the share of their
-# light is known better than the last number, it is as many times larger: companions of a bright
-# star show far beyond, and bright stars are few.
+# Companions that are searched for, in magnitudes fainter than the star; the logarithm of the odds
+# for any of them that noise exceeds for one single star in a hundred; and an error of the share of
+# light.  If the share is known better than this, the limit is larger in proportion: companions of
+# bright stars exceed it by far, and bright stars are few.
 _FAINTER = np.linspace(0, 4, 9)
 _ODDS, _KNOWN = 1.2, 0.017
-# Stars nearest in place, and the best measured of all, that tell how profiles differ.
+# Number of nearest stars, and of the best measured stars of all, that show how profiles differ.
 _NEAREST, _BEST = 25, 300
 _LEAST = 20
 # Variance of a median over that of a mean.
 _MEDIAN_COST = 1.57
-# Outliers, in median absolute widths; and so few that both sides are needed.
+# Limit for outliers, in median absolute widths; and with fewer stars than this, both sides count.
 _OUTLIER, _FEW = 6.0, 60
 
 
 def weigh_neighbors(field, profile, noise, stars, covariance, radius, unsure):
-    r"""Find what neighbors cost the positions of stars that were fitted in turn with them.
+    r"""Compute how neighbors increase the errors of stars that were fitted in turn with them.
 
     Parameters
     ----------
     field, profile, noise, radius
         As for `fit_stars`.
     stars : Stars
-        All stars as fitted; those without a fit with the flux they may have.
+        All stars as fitted; those without a fit have the flux that they may have.
     covariance : (N, 3, 3) ndarray
-        Of every star's fit alone; NaN where there is none.
+        Covariance of the fit of each star alone; NaN where there is no fit.
     unsure : (N,) ndarray
-        Relative error of every star's light in the pixels of its neighbors.
+        Relative error of the light of each star in the pixels of its neighbors.
 
     Returns
     -------
     joint : (N, 3, 3) ndarray
-        Covariance of the fit of all together; NaN where it cannot tell a star from its neighbors.
+        Covariance of a fit of all stars together; NaN where a star and its neighbors cannot be
+        separated.
     shift : (N,) ndarray
-        Error of the position in px by what is wrong in the models of the neighbors.
+        Error of the position in px from errors of the models of the neighbors.
 
     Notes
     -----
     With :math:`N_{ij}` the weighted products of the derivatives of stars i and j over the pixels of
-    i, the covariance is that of the star with its neighbors eliminated,
+    i, the covariance of a star with its neighbors eliminated is
 
     .. math::
         C_i = \Big(N_{ii} - \sum_j N_{ij} N_{jj}^{-1} N_{ji}\Big)^{-1},
 
-    and all of the light of neighbor j would shift it by
+    and the whole light of neighbor j would shift it by
     :math:`(N_{ii}^{-1} N_{ij})_{xf} f_j`.
     """
     joint, shift = covariance.copy(), np.zeros(len(stars.x))
@@ -95,37 +96,37 @@ def _inverse(normal):
 
 
 def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtracted=False):
-    r"""Compare the profiles of stars with that of the frame: two stars, or one as they are.
+    r"""Test whether the profiles of stars are those of one star or of two.
 
     Parameters
     ----------
     field, profile, noise, radius
         As for `fit_stars`.
     stars : Stars
-        The stars as fitted; those that are not to be judged have no flux.
+        The stars as fitted; those that are not to be tested have no flux.
     clean : (N,) ndarray of bool
-        True for those that may tell what stars have in common.
+        True for stars that may show what profiles have in common.
     fwhm : float
         FWHM in px.
     subtracted : bool, optional
-        Whether the models of all stars have been taken off the image.
+        Whether the models of all stars have been subtracted from the image.
 
     Returns
     -------
     broad : (N,) ndarray of bool
         True for the stars that two stars describe better than one.
     excess : (N,) ndarray
-        Reduced chi square that comes from how the profiles of the frame's stars differ.
+        Reduced chi square caused by differences between the profiles of the stars of the frame.
 
     Notes
     -----
-    A companion nearer than the PSF is wide makes a star broader and one-sided: what is left of its
-    light when position and flux of the star have taken up what they can.  That is, for the most
-    part, a sum of the second and higher derivatives of the profile.  Their amplitudes are fitted,
-    what the nearest bright stars have in common is taken off, and the likelihood with a companion,
-    averaged over directions and magnitudes, over that without one decides.  How profiles differ
-    from star to star (by color, or because the PSF does not follow) shows in those that are
-    narrower, which no companion makes.
+    A companion that is closer than the width of the PSF makes a star broader and asymmetric: these
+    are the effects that position and flux of the star cannot absorb.  They are nearly a sum of the
+    second and higher derivatives of the profile.  The amplitudes of these derivatives are fitted,
+    and the common part of the nearest bright stars is subtracted.  Then the likelihood of a
+    companion, averaged over directions and magnitudes, is compared with the likelihood of a single
+    star.  Differences between profiles from other causes (colors, or an imperfect PSF) are measured
+    from the stars that are narrower, because no companion makes a star narrower.
     """
     broad, excess = np.zeros(len(stars.x), bool), np.zeros(len(stars.x))
     rows = np.flatnonzero(stars.flux > 0)
@@ -154,7 +155,7 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     after = np.einsum("si,sij,sj->s", amplitude, weight, amplitude)
     excess[rows] = (before - after) / freedom
     pushed = weight @ changes
-    # One over the error of a companion's share of the light.
+    # One over the error of the share of light of a companion.
     known = np.sqrt(np.maximum(np.einsum("id,sid->sd", changes, pushed), 1e-300))
     share = np.einsum("si,sid->sd", amplitude, pushed) / known**2
     limit = _ODDS * np.maximum(_KNOWN * known.mean(axis=1), 1)
@@ -163,10 +164,10 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
 
 
 def _log_odds(share, known):
-    """Logarithm of the odds (N,) for a companion, wherever and however bright it may be.
+    """Logarithm of the odds (N,) for a companion of any position and brightness.
 
-    From the shares of the light (N, K) that a companion at each place seems to have, and one over
-    their errors.
+    The arguments are the shares of the light (N, K) that a companion at each place seems to have,
+    and one over their errors.
     """
     odds = [
         np.logaddexp.reduce(light * known**2 * (share - 0.5 * light), axis=1)
@@ -176,7 +177,7 @@ def _log_odds(share, known):
 
 
 def _normal(field, profile, noise, stars, modes, *, radius, subtracted):
-    """Set up the normal equations of the modes; also the freedom of the fits without them."""
+    """Set up the normal equations of the modes, and the freedom of fits without them."""
     half = int(np.ceil(radius))
     use = field.cut(stars, half, radius)[3]
     left, right = reduced_normal(
@@ -186,9 +187,9 @@ def _normal(field, profile, noise, stars, modes, *, radius, subtracted):
 
 
 def _best_everywhere(stars, clean, size):
-    """Rows of the best measured stars, as many from each part of the frame as there are.
+    """Rows of the best measured stars, about the same number from each part of the frame.
 
-    The best of all may be in one cluster, and tell nothing of a corner.
+    Otherwise all of them could be in one cluster, and show nothing about a corner.
     """
     size = np.where(size > 0, size, np.inf)
     clean = clean[np.argsort(size, kind="stable")]
@@ -199,23 +200,23 @@ def _best_everywhere(stars, clean, size):
 
 
 def _common(stars, amplitude, covariance, best):
-    """Median amplitudes of the nearest of the best measured stars, and their covariance."""
+    """Median amplitudes of the nearest well measured stars, and their covariance."""
     places = np.column_stack([stars.x, stars.y])
     tree = KDTree(places[best])
     k = min(_NEAREST, len(best))
     near = best[tree.query(places[best], k=k)[1]]
     noise = _MEDIAN_COST / k * covariance[near].mean(axis=1)
-    # Those of the best star next to it, which differ little from its own.
+    # Use those of the nearest of the best stars, which differ little.
     nearest = tree.query(places)[1]
     return np.median(amplitude[near], axis=1)[nearest], noise[nearest]
 
 
 def _differences(amplitude, covariance, narrower):
-    """Covariance (R, R) of how profiles differ from star to star.
+    """Covariance (R, R) of the differences between the profiles of stars.
 
-    By color, brightness or a place that the PSF does not follow.  Those stars tell that are
-    narrower than usual, which no companion makes; of few stars all do, since the brightest of them
-    make the PSF.
+    They depend on color and brightness, or on position where the PSF is imperfect.  They are
+    measured from stars that are narrower than usual, because no companion makes a star narrower;
+    if there are few stars, from all of them, because the brightest ones determine the PSF.
     """
     size = np.linalg.norm(amplitude, axis=1)
     told = size < _OUTLIER * np.median(size)

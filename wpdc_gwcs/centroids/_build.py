@@ -1,4 +1,4 @@
-"""The effective PSF of a frame, learned from its own stars."""
+"""The effective PSF of a frame, learned from its stars."""
 
 from dataclasses import replace
 
@@ -31,24 +31,24 @@ OVERSAMPLING = 4
 
 _SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 
-# Expected size of the difference between the PSF and a Moffat profile, relative to the profile:
-# of its fourth differences (in units of a Gaussian's), and of itself.
+# Expected size of the difference between the PSF and a Moffat profile, relative to the profile: of
+# its fourth differences (in units of those of a Gaussian), and of the difference itself.
 _ROUGHNESS = 0.4
 _DEVIATION = 0.3
 
-# Parts of a frame along each axis, which stars are taken from in turn.
+# Number of parts of a frame along each axis, from which stars are taken in turn.
 _PARTS = 6
 
-# FWHM in px of the finest structure from which knots every half pixel follow it as well as those
-# every quarter: to a thousandth for a Gaussian.  Wide profiles are quicker with them.
+# If the finest structure has at least this FWHM in px, knots every half pixel are as good as knots
+# every quarter: to a thousandth for a Gaussian.  They save time for wide profiles.
 _HALF_PIXEL_KNOTS = 1.8
 
-# Pixels further off the model than this many sigma weigh as if they were there.
+# Pixels that deviate by more than this many sigma have the weight of pixels at this limit.
 _HUBER = 3.0
 
 
 def select_stars(stars, snr, quality, fwhm, shape, *, n_max, min_snr):
-    """Choose bright, isolated stars that are spread over the frame.
+    """Choose bright, isolated stars, spread over the frame.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def select_stars(stars, snr, quality, fwhm, shape, *, n_max, min_snr):
     rows = rows[np.argsort(flux[rows])[::-1]]
     if len(rows) <= n_max:
         return rows
-    # The same number from each part of the frame, as far as they have as many.
+    # The same number from each part of the frame, as far as it has that many.
     places = np.column_stack([x[rows], y[rows]])
     rank = rank_in_parts(places, np.zeros(2), np.array(shape[::-1]))
     return rows[np.sort(np.argsort(rank, kind="stable")[:n_max])]
 
 
 def rank_in_parts(places, low, high):
-    """Rank stars within the part of the area that they are in, one of 6 x 6.
+    """Rank stars within their parts of an area, which is divided into 6 x 6.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def rank_in_parts(places, low, high):
     Returns
     -------
     (N,) int ndarray
-        Number of better stars in the same part.
+        Number of better stars in the same part, for each star.
     """
     side = (high - low) / _PARTS
     column, row = np.clip((places - low) / np.maximum(side, 1e-9), 0, _PARTS - 1).astype(int).T
@@ -109,7 +109,7 @@ def rank_in_parts(places, low, high):
 
 
 def isolated(stars, fwhm):
-    """Mark the stars whose neighbors are too faint or too far to matter.
+    """Mark the stars whose neighbors are too faint or too far away to matter.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def isolated(stars, fwhm):
     Returns
     -------
     (N,) bool ndarray
-        True for those that are alone.
+        True for isolated stars.
     """
     x, y, flux = stars
     alone = np.ones(len(x), bool)
@@ -129,14 +129,14 @@ def isolated(stars, fwhm):
     if len(pairs):
         i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
         near = np.hypot(x[i] - x[j], y[i] - y[j]) / fwhm
-        # Tolerable neighbors are the fainter the nearer they are; what they leave is clipped.
+        # The closer a neighbor is, the fainter it must be; what remains of it is clipped.
         limit = 0.02 * np.maximum(near - 1, 0) ** 2
         alone[i[flux[j] > limit * flux[i]]] = False
     return alone
 
 
 def fit_moffat(field, noise, stars, fwhm, *, half, radius):
-    """Fit one elliptical, pixel-integrated Moffat profile to stars.
+    """Fit a single elliptical, pixel-integrated Moffat profile to stars.
 
     Parameters
     ----------
@@ -147,9 +147,9 @@ def fit_moffat(field, noise, stars, fwhm, *, half, radius):
     fwhm : float
         FWHM in px to start from.
     half : int
-        Half-width in px of the profile's grid.
+        Half width in px of the grid of the profile.
     radius : float
-        Radius in px of the pixels fitted.
+        Radius in px of the pixels that are fitted.
 
     Returns
     -------
@@ -158,9 +158,9 @@ def fit_moffat(field, noise, stars, fwhm, *, half, radius):
 
     Notes
     -----
-    An analytic profile knows nothing of pixels, so its fit gives positions without error that
-    depends on the pixel phase.  A free profile cannot find that error by itself: positions off by
-    any function of the phase go with a profile that fits as well.
+    An analytic profile does not depend on pixels, so positions from its fit have no error that
+    depends on the pixel phase.  A free profile cannot detect such an error: positions that are off
+    by any function of the phase have a corresponding profile that fits equally well.
     """
     shape = np.array([np.log(max(0.5 * np.sqrt(max(fwhm**2 - 0.7, 0.3)), 0.3)), np.log(2.0), 0, 0])
     lowest = [np.log(0.2), np.log(0.3), -0.9, -0.9]
@@ -200,27 +200,27 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
     stars : Stars
         Start values.
     start : Profile
-        Profile to start from, constant or varying; what is learned is the difference from it,
-        the same all over the detector.
+        Profile to start from, constant or varying.  The difference from it is learned, which is the
+        same for the whole detector.
     fwhm : float
         FWHM in px.
     radius : float
-        Radius in px of the pixels that positions are fitted on.
+        Radius in px of the pixels to which positions are fitted.
     gain : float or None
         Electrons per count.
     iterations : int
         Number of rounds.
     finest : float, optional
-        FWHM in px of the finest structure expected in the profile; by default that of the stars.
+        FWHM in px of the finest structure expected in the profile.  Default: that of the stars.
 
     Returns
     -------
     profile : Profile
         Profile, normalized and centered.
     stars : Stars
-        Stars kept.
+        Stars that were kept.
     noise : Noise
-        Noise with the profile's own error.
+        Noise, including the error of the profile.
     """
     profile = start
     for _ in range(iterations):
@@ -230,7 +230,7 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
             break
         bins = bin_noise(field, profile, noise, stars, radius=radius)
         noise = estimate_noise(bins, gain)
-        # A profile is never known better, and the brightest stars must not rule alone.
+        # No profile is known better than this, and the brightest stars alone must not decide.
         noise = replace(noise, mismatch=float(np.clip(noise.mismatch, 0.003, 0.3)))
         change = _residual_coefficients(field, noise, start, stars, fwhm, finest or fwhm)
         profile = center_profile(replace(start, coefficients=start.coefficients + change), fwhm)
@@ -239,7 +239,7 @@ def learn_profile(field, noise, stars, start, *, fwhm, radius, gain, iterations,
 
 
 def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
-    """Spline coefficients that take up what a profile leaves: penalized least squares."""
+    """Fit spline coefficients to the residuals of a profile by penalized least squares."""
     stride = 2 if finest >= _HALF_PIXEL_KNOTS else 1
     over, size = profile.oversampling // stride, (profile.coefficients.shape[-1] - 1) // stride + 1
     half = profile.radius - 1
@@ -256,7 +256,7 @@ def _residual_coefficients(field, noise, profile, stars, fwhm, finest):
     base_x, taps_x, _ = spline_taps(center - over * (x - xc))
     base_y, taps_y, _ = spline_taps(center - over * (y - yc))
     taps = (taps_y[:, :, None] * taps_x[:, None, :]).reshape(-1, 16)
-    # Of the symmetric products the lower half.
+    # Lower half of the symmetric products.
     first, second = np.tril_indices(16)
     squares = taps[:, first] * taps[:, second]
     width = 4 * size + 5
@@ -292,7 +292,7 @@ def _tiles(half, over):
 
 
 def _halved(coefficients):
-    """Coefficients, along the first axis, of the same splines with a knot more between any two."""
+    """Coefficients, along the first axis, of the same splines with a knot added in each gap."""
     padded = np.pad(coefficients, ((1, 1), (0, 0)))
     finer = np.empty((2 * len(coefficients) - 1, coefficients.shape[1]))
     finer[::2] = (padded[:-2] + 6 * coefficients + padded[2:]) / 8
@@ -301,20 +301,20 @@ def _halved(coefficients):
 
 
 def _add_prior(band, samples, fwhm, finest, over, area):
-    """Add the expectation that a difference is small and smooth to banded normal equations.
+    """Add the prior that a difference is small and smooth to banded normal equations.
 
-    The area is that of a cell of the grid, in those of the finest grid, which weigh one each.
+    The area is that of a cell of the grid, in units of a cell of the finest grid.
     """
     size = samples.shape[0]
     center = (size - 1) // 2
     radius = np.hypot(*np.meshgrid(np.arange(size) - center, np.arange(size) - center)) / over
-    # A smooth envelope of the profile, with wings that stay open for spikes and haloes.
+    # A smooth envelope of the profile, whose wings leave room for spikes and halos.
     envelope = samples.max() * (1 + (2 * radius / fwhm) ** 2 * (2**0.5 - 1)) ** -2
     sigma = finest * _SIGMA_PER_FWHM * over  # grid steps
     rough = area * (_ROUGHNESS * 3 * sigma**-4 * envelope) ** -2
-    # Where there is finer structure than in a star of this width, the start is only its outline.
+    # If there is finer structure than the width suggests, the start is only an outline.
     own = area * (_DEVIATION * (fwhm / finest) * envelope) ** -2
-    # Nothing is known about the rim: the profile there is the start's.
+    # Nothing is known about the rim, so the profile remains that of the start there.
     rim = np.abs(np.arange(size) - center) > center - over
     own[rim] *= 1e8
     own[:, rim] *= 1e8
@@ -328,24 +328,24 @@ def _add_prior(band, samples, fwhm, finest, over, area):
         weight, first = weight.ravel(), first.ravel()
         for i in range(5):
             for j in range(i + 1):
-                # Distinct columns: no two rows of differences add to the same place.
+                # The columns are distinct: no two rows of differences add to the same element.
                 band[stride * (i - j), first + stride * j] += difference[i] * difference[j] * weight
 
 
 def center_profile(profile, fwhm):
-    """Make sums of one and windowed centroids at the origin.
+    """Normalize a profile to unit sum, with its windowed centroid at the origin.
 
     Parameters
     ----------
     profile : Profile
         Profile.
     fwhm : float
-        FWHM in px, of the window as well.
+        FWHM in px of the profile and of the window.
 
     Returns
     -------
     Profile
-        The profile, moved and scaled at every place.
+        The profile, shifted and scaled at every place.
     """
     over = profile.oversampling
     size = profile.coefficients.shape[-1]

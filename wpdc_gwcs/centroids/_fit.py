@@ -19,7 +19,7 @@ __all__ = [
     "star_like",
 ]
 
-# Stars fitted at a time: bounds the memory for their pixels.
+# Number of stars fitted at a time, which limits the memory for their pixels.
 _CHUNK = 4000
 
 _MAX_STEP = 0.5  # px per iteration
@@ -28,14 +28,14 @@ _CONVERGED = 1e-4  # px
 
 
 class Sky(NamedTuple):
-    """Background of pixels.
+    """Noise of the background in pixels.
 
     Parameters
     ----------
     variance : (N, n) ndarray
         Variance.
     photons : (N, n) ndarray or float
-        Variance of photons relative to what the gain says, where pixels differ in response.
+        Variance of photons relative to that from the gain, for pixels that differ in response.
     """
 
     variance: np.ndarray
@@ -60,7 +60,7 @@ class Field:
     photons : (ny, nx) ndarray or None
         As in `Sky`; None for pixels of one response.
     full : (ny, nx) bool ndarray or None
-        More pixels that must not be used: those that are saturated.
+        True where a pixel is saturated, and must not be used either.
     """
 
     image: np.ndarray
@@ -70,12 +70,12 @@ class Field:
     full: np.ndarray | None = None
 
     def rows(self, start, stop, *, image):
-        """Take some rows, with another image for theirs.
+        """Return some rows, with another image in place of theirs.
 
         Parameters
         ----------
         start, stop : int
-            The first row, and the one behind the last.
+            First row, and the row after the last.
         image : (stop - start, nx) ndarray
             Pixels.
 
@@ -91,7 +91,7 @@ class Field:
         return Field(image, self.rms[start:stop], mask, photons, full)
 
     def cut(self, stars, half, radius):
-        """Cut out the surroundings of stars.
+        """Make cut-outs around stars.
 
         Parameters
         ----------
@@ -336,7 +336,7 @@ def normal_step(basis, flux, pixels, use, sky, noise):
 
 
 def star_like(flux, chi2, valid, *, limit=2.5, width=31):
-    """Mark the fits that are no worse than those of sources of about the same flux.
+    """Mark the fits that are as good as those of sources of about the same flux.
 
     Parameters
     ----------
@@ -345,20 +345,20 @@ def star_like(flux, chi2, valid, *, limit=2.5, width=31):
     valid : (N,) bool ndarray
         True where the fit converged.
     limit : float, optional
-        Greatest chi square relative to what is typical of the sources next in flux.
+        Greatest chi square relative to the typical one of sources of similar flux.
     width : int, optional
-        Number of sources compared with.
+        Number of sources of similar flux.
 
     Returns
     -------
     (N,) bool ndarray
-        True for single stars, as far as can be told.
+        True for fits that look like single stars.
     """
     rows = np.flatnonzero(valid)
     if len(rows) < 5:
         return valid.copy()
     rows = rows[np.argsort(flux[rows])]
-    # Below the median: galaxies and cosmic rays may be the majority.
+    # A quantile below the median, because galaxies and cosmic rays may be the majority.
     typical = percentile_filter(chi2[rows], 35, size=min(width, len(rows)), mode="nearest")
     result = np.zeros(len(flux), bool)
     result[rows] = chi2[rows] < limit * typical

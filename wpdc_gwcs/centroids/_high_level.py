@@ -1,4 +1,4 @@
-"""Public functions: arguments checked, tables in and out."""
+"""Public functions: they check arguments, and take and return tables."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -27,17 +27,17 @@ __all__ = [
     "subtract_stars",
 ]
 
-# Share of the noise in stars that must be that of their photons to tell the gain.
+# Fraction of the noise in stars that must come from photons to determine the gain.
 _LEAST_PHOTONS = 0.1
-# Reduced chi square up to which the formal errors stand; beyond, they grow with its root.
+# Above this reduced chi square, formal errors are multiplied by the square root of the excess.
 _TOLERATED_CHI2 = 1.5
-# Share of the wobble of the center of light with the place in the pixel that one frame cannot tell:
-# by so much it depends on the kind of profile that the PSF is learned from.
+# Fraction of the motion of the center of light with the pixel phase that one frame cannot
+# determine: it depends by this much on the kind of profile from which the PSF is learned.
 _UNKNOWN_WOBBLE = 0.3
 
 
 def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0, vary="auto"):
-    r"""Effective PSF of a frame, from its bright, clean and isolated stars.
+    r"""Build the effective PSF of a frame from its bright, clean and isolated stars.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
     min_snr : float, optional
         Least signal-to-noise ratio of a star used.
     vary : {"auto", "never"}, optional
-        Whether the PSF may vary over the detector: if it then describes left-out stars better.
+        ``auto`` lets the PSF vary over the detector if it then describes left-out stars better.
 
     Returns
     -------
@@ -69,14 +69,14 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
 
     Notes
     -----
-    An effective PSF :math:`\psi` (Anderson & King 2000, PASP 112, 1360) gives the share of the flux
-    that a pixel at an offset from the star gets, so that :math:`I_{ij} = f \psi(i - x, j - y)`
-    without any integration.  It is described by cubic B-splines with knots every quarter pixel; all
-    coefficients come from one penalized least-squares problem over all pixels of all stars, in
-    turn with the positions and fluxes.  The penalty keeps :math:`\psi` close to a Moffat profile
-    that is integrated over the pixels and fitted before, as far as noise or uneven sampling leave
-    it open.  That start matters: positions off by a function of the pixel phase, together with a
-    profile distorted the same way, fit a single frame as well as the truth.
+    An effective PSF :math:`\psi` (Anderson & King 2000, PASP 112, 1360) is the fraction of the flux
+    that falls into a pixel at an offset from the star, so :math:`I_{ij} = f \psi(i - x, j - y)`
+    without any integration.  It is described by cubic B-splines with knots every quarter pixel.
+    All coefficients come from one penalized least-squares problem over all pixels of all stars,
+    which alternates with fits of the positions and fluxes.  Where noise or uneven sampling leave
+    :math:`\psi` undetermined, the penalty keeps it close to a pixel-integrated Moffat profile that
+    is fitted first.  This start matters: positions that are off by a function of the pixel phase
+    fit a single frame as well as the truth, if the profile is distorted correspondingly.
 
     Examples
     --------
@@ -103,7 +103,7 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
 def measure_psf(
     data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0, vary="auto", name=None
 ):
-    """Effective PSF of a frame, as `build_epsf`, without photutils.
+    """Measure the effective PSF of a frame like `build_epsf`, but without photutils.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def fit_centroids(
     data : Background or (ny, nx) array_like
         Image without background; of a plain array, ``error`` must be given.
     sources : `~astropy.table.Table`
-        Columns ``x``, ``y``, ``flux`` to start from, and those to carry along.
+        Columns ``x``, ``y``, ``flux`` with start values; other columns are kept.
     epsf : `~photutils.psf.ImagePSF`, `~photutils.psf.GriddedPSFModel` or Profile
         Effective PSF.
     gain : float, optional
@@ -171,50 +171,50 @@ def fit_centroids(
     error : float or (ny, nx) array_like, optional
         Standard deviation of the background; only for a plain array.
     passes : int, optional
-        Number of rounds; from the second on, the neighbors' models are subtracted, and stars that
-        share pixels are improved together.
+        Number of rounds.  From the second one on, the models of neighbors are subtracted, and stars
+        that share pixels are improved together.
     refit : bool, optional
-        The sources have been fitted before, or found beside such: neighbors are subtracted from
-        the first round on.  A source on the flank of a brighter one needs that.
+        Whether to subtract neighbors from the first round on.  This is for sources that have been
+        fitted before, or were found next to fitted ones, on the flank of a brighter source.
     subtracted : `~astropy.table.Table`, optional
-        Result of a call with ``overwrite`` for the first of these sources: their models have been
-        taken off the image.
+        Result of an earlier call with ``overwrite`` for the first of these sources, whose models
+        have been subtracted from the image.
     overwrite : bool, optional
-        Take the models of the fitted stars off the image of the Background itself, and leave it
-        so, instead of off a copy.
+        Whether to subtract the models of the fitted stars from the image of the Background itself
+        instead of from a copy.
     judge : bool, optional
-        Whether to find what neighbors cost, and who is broader than a star: errors and flags of a
-        first round do without.
+        Whether to include the effect of neighbors in the errors, and to flag sources that are
+        broader than a star.  A preliminary fit does not need this.
 
     Returns
     -------
     `~astropy.table.Table`
         Copy of the sources with new ``x``, ``y``, ``x_err``, ``y_err``, ``flux``, ``flux_err``,
-        ``snr``, and ``chi2``, the chi square per degree of freedom.  Where the fit failed, the
-        values stay and ``flags`` has `wpdc_gwcs.detection.FLAG_FIT_FAILED`; ``chi2`` is NaN.
-        The flag is also set where the fit is far worse than that of other sources as bright.
+        ``snr``, and ``chi2``, the chi square per degree of freedom.  If a fit fails, the old values
+        are kept, ``flags`` has `wpdc_gwcs.detection.FLAG_FIT_FAILED`, and ``chi2`` is NaN.  The
+        flag is also set if a fit is far worse than those of sources of similar brightness.
 
     Notes
     -----
-    Gauss-Newton on :math:`(x, y, f)` over the pixels within 1.25 FWHM (at least 2.5 px), with the
-    weights of background, photons and the PSF's own error :math:`\epsilon`, measured on the
-    residuals of bright stars:
+    :math:`(x, y, f)` are fitted by the Gauss-Newton method to the pixels within 1.25 FWHM (at least
+    2.5 px).  The weights include background, photons and the error :math:`\epsilon` of the PSF,
+    which is measured from the residuals of bright stars:
 
     .. math::
         \sigma^2 = \sigma_\mathrm{sky}^2 + f \psi / g
                    + \epsilon^2 f^2 \psi \psi_\mathrm{max} .
 
-    For positions and their errors :math:`\epsilon` is that part which is odd about the star, for
-    :math:`\chi^2` all of it.
+    For positions and their errors, :math:`\epsilon` is the part of the error that is odd about the
+    star; for :math:`\chi^2`, it is the whole error.
 
-    The errors are those of all stars fitted together: of the normal matrix with the neighbors
-    eliminated, times :math:`\sqrt{\chi^2 / 1.5}` where that is more than 1, and what is wrong in
-    the models of the neighbors besides, and 0.3 of the wobble of the center of light with the place
-    in the pixel, which matters below a FWHM of 1.5 px.
+    The errors are those of a fit of all stars together.  They come from the normal matrix with the
+    neighbors eliminated, multiplied by :math:`\sqrt{\chi^2 / 1.5}` if this is more than 1.  Errors
+    of the models of the neighbors are added, and so is 0.3 times the motion of the center of light
+    with the pixel phase, which matters below a FWHM of 1.5 px.
 
-    Where neighbors cost a star more than half of its error and more than 0.01 px,
-    `wpdc_gwcs.detection.FLAG_BLENDED` is set, and it is cleared elsewhere; where two stars describe
-    a profile better than one, `wpdc_gwcs.detection.FLAG_EXTENDED`.
+    `wpdc_gwcs.detection.FLAG_BLENDED` is set if neighbors add more than half of its error, and more
+    than 0.01 px, to the error of a star; otherwise it is cleared.
+    `wpdc_gwcs.detection.FLAG_EXTENDED` is set if two stars describe a profile better than one.
 
     Examples
     --------
@@ -263,19 +263,19 @@ def fit_centroids(
 
 
 def residual_of(background, sources, epsf, *, gain=None, subtracted=False):
-    """Take the models of fitted stars off an image, where and when it is asked for.
+    """Subtract the models of fitted stars from parts of an image on request.
 
     Parameters
     ----------
     background, sources, epsf, gain
         As for `subtract_stars`.
     subtracted : bool, optional
-        Whether the models have been taken off the image, as by `fit_centroids` with ``overwrite``.
+        Whether the models have already been subtracted, by `fit_centroids` with ``overwrite``.
 
     Returns
     -------
     Residual
-        What gives the rows of the residual image, as `detect_companions` takes it.
+        Source of rows of the residual image, for `detect_companions`.
     """
     drawn = np.isfinite(np.asarray(sources["chi2"], dtype=float))
     stars = _stars_of(sources, background.unit).take(drawn)
@@ -284,14 +284,14 @@ def residual_of(background, sources, epsf, *, gain=None, subtracted=False):
 
 
 def subtract_stars(background, sources, epsf, *, gain=None):
-    """Take the models of fitted stars off an image.
+    """Subtract the models of fitted stars from an image.
 
     Parameters
     ----------
     background : Background
         Image without background.
     sources : `~astropy.table.Table`
-        Result of `fit_centroids`; rows without a fit (``chi2`` is NaN) are left in the image.
+        Result of `fit_centroids`; sources without a fit (``chi2`` is NaN) remain in the image.
     epsf : `~photutils.psf.ImagePSF`, `~photutils.psf.GriddedPSFModel` or Profile
         Effective PSF.
     gain : float, optional
@@ -300,8 +300,8 @@ def subtract_stars(background, sources, epsf, *, gain=None):
     Returns
     -------
     Background
-        The residual image.  Its ``rms`` is that of the background, of the stars' photons and of
-        an error of the PSF by 10 %: what stands out of it is no residual of a known star.
+        The residual image.  Its ``rms`` includes the background, the photons of the stars and an
+        error of the PSF of 10 %, so what exceeds it is not a residual of a known star.
 
     Examples
     --------
@@ -312,19 +312,19 @@ def subtract_stars(background, sources, epsf, *, gain=None):
 
 @dataclass(frozen=True)
 class StarNoise:
-    """What the residuals of bright stars tell of an image.
+    """Noise of an image according to the residuals of bright stars.
 
     Parameters
     ----------
     gain : float
-        Electrons per count by which the noise grows with the stars' light; NaN where errors of the
-        PSF hide it.
+        Electrons per count, from the increase of the noise with the light of the stars; NaN if
+        errors of the PSF hide it.
     least_gain : float
-        Gain below which the photons alone would make more noise than there is, 0 if unknown.
+        Gain below which photons alone would make more noise than observed; 0 if unknown.
     mismatch : float
-        Error of the PSF at its peak, relative to its value there.
+        Error of the PSF at its peak, relative to the peak.
     n_stars : int
-        Number of stars.
+        Number of stars used.
     """
 
     gain: float
@@ -335,7 +335,7 @@ class StarNoise:
 
 @one_blas_thread
 def measure_noise(data, sources, epsf, *, error=None):
-    """Measure gain and error of the PSF on the residuals of bright stars.
+    """Measure the gain and the error of the PSF from the residuals of bright stars.
 
     Parameters
     ----------
@@ -355,8 +355,8 @@ def measure_noise(data, sources, epsf, *, error=None):
 
     Notes
     -----
-    A PSF that was made from the same stars has taken some of their noise into it, and the gain
-    comes out up to a third too high; from one that was made from other stars it is right.
+    A PSF that was made from the same stars contains some of their noise, so the gain is up to a
+    third too high.  With a PSF that was made from other stars, it is correct.
 
     Examples
     --------
@@ -382,7 +382,7 @@ def _fitted_table(sources, fits, shift, flags, fwhm, unit):
     error = np.sqrt(np.where(good[:, None], np.einsum("sii->si", fits.covariance), np.nan))
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = fits.stars.flux / error[:, 2]
-        # Beyond chance, a high chi square is an unseen neighbor or a PSF that does not fit.
+        # A chi square above the limit means an undetected neighbor, or a PSF that does not fit.
         error *= np.sqrt(np.maximum(fits.chi2 / _TOLERATED_CHI2, 1))[:, None]
     error[:, :2] = np.hypot(error[:, :2], shift[:, None] / np.sqrt(2))
     columns = {
@@ -398,7 +398,7 @@ def _fitted_table(sources, fits, shift, flags, fwhm, unit):
         old = np.asarray(sources[name], float) if name in sources.colnames else np.nan
         result[name] = np.where(good, values, old)
     result["chi2"] = np.where(good, fits.chi2, np.nan)
-    # Neither a star nor noise: far worse than its like, which share the error of the PSF.
+    # Not a star: the fit is far worse than those of similar stars, with the same error of the PSF.
     alike = star_like(fits.stars.flux, fits.chi2, good, limit=MAX_CHI2)
     poor = ~good | (~alike & (fits.chi2 > MAX_CHI2))
     result["flags"] = flags | np.where(poor, FLAG_FIT_FAILED, 0)
@@ -411,12 +411,12 @@ def _stars_of(sources, unit):
 
 
 def _per_unit(gain, unit):
-    """Electrons in one unit of the pixels fitted."""
+    """Electrons per unit of the pixel values."""
     return None if gain is None else gain * unit
 
 
 def _typical_fwhm(sources):
-    """FWHM of the stars: from detection, else the median of the column."""
+    """FWHM of the stars from the metadata, or else the median of the column."""
     if (fwhm := sources.meta.get("fwhm")) is not None:
         return float(fwhm)
     if "fwhm" in sources.colnames and np.isfinite(sources["fwhm"]).any():
@@ -431,7 +431,7 @@ def _field_of(data, error, saturation=None):
             raise ValueError("error must not be given: the Background has its own")
         if saturation is None:
             return Field(data.image, data.rms, data.mask, data.photons), data.unit
-        # The wings of a saturated star still tell its flux, which matters to its neighbors.
+        # The wings of a saturated star still determine its flux, which matters to its neighbors.
         full = data.saturated(saturation)
         return Field(data.image, data.rms, data.mask, data.photons, full), data.unit
     image = np.asarray(data)

@@ -4,12 +4,12 @@ import numpy as np
 
 __all__ = ["inverses"]
 
-# Added to the unit diagonal of normal matrices, far below what is known of anything.
+# Added to the unit diagonal of normal matrices; far too small to change any result.
 _RIDGE = 1e-13
 
 
 def inverses(normal):
-    """Invert symmetric matrices, of which some may be singular.
+    """Invert symmetric matrices, some of which may be singular.
 
     Parameters
     ----------
@@ -19,7 +19,7 @@ def inverses(normal):
     Returns
     -------
     (N, n, n) ndarray
-        Inverses, large where next to nothing is known; zero where the diagonal is.
+        Inverses, large where almost nothing is known, and zero where the diagonal is zero.
     """
     diagonal = np.einsum("sii->si", normal)
     known = diagonal > 0

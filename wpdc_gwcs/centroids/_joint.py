@@ -1,4 +1,4 @@
-"""Stars that share pixels: how their fits depend on each other, and steps of all at once."""
+"""Stars that share pixels: how their fits depend on each other, and joint steps."""
 
 import numpy as np
 from scipy.sparse import bsr_array
@@ -9,17 +9,17 @@ from wpdc_gwcs.centroids._fit import Stars, normal_step
 
 __all__ = ["cross_products", "joint_step", "pairs_that_share"]
 
-# Neighbors that share pixels with a fit are at most this far, in radii of the fits.
+# Greatest distance of neighbors that share pixels with a fit, in radii of the fits.
 _REACH = 1.8
-# Pairs at a time: bounds the memory for their pixels.
+# Number of pairs processed at a time, which limits the memory for their pixels.
 _CHUNK = 4000
-# Steps in px at most, and the share of the diagonal added to it: stars that cannot be told from
-# each other keep their places.
+# Largest step in px, and the fraction of the diagonal that is added to it, so that stars that
+# cannot be separated keep their positions.
 _MAX_STEP, _DAMPING = 0.5, 0.02
 
 
 def pairs_that_share(stars, radius):
-    """Find the stars that have pixels of their fits in common.
+    """Find the pairs of stars whose fits share pixels.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def pairs_that_share(stars, radius):
     Returns
     -------
     (P, 2) int ndarray
-        Pairs, in the second half those of the first the other way round.
+        Pairs; the second half has those of the first half in reverse order.
     """
     pairs = KDTree(np.column_stack([stars.x, stars.y])).query_pairs(
         _REACH * radius, output_type="ndarray"
@@ -40,7 +40,7 @@ def pairs_that_share(stars, radius):
 
 
 def cross_products(field, profile, noise, stars, pairs, radius):
-    """Find the weighted products of the derivatives of two stars over the pixels of the first.
+    """Compute the weighted products of the derivatives of two stars over the pixels of the first.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def cross_products(field, profile, noise, stars, pairs, radius):
     stars : Stars
         The stars.
     pairs : (P, 2) int ndarray
-        Pairs of them.
+        Pairs of stars.
 
     Returns
     -------
@@ -78,28 +78,28 @@ def _products(field, profile, noise, stars, others, radius):
 
 
 def joint_step(field, profile, noise, stars, rows, radius):
-    r"""Improve positions and fluxes of stars that share pixels, all at once.
+    r"""Improve the positions and fluxes of stars that share pixels, all together.
 
     Parameters
     ----------
     field : Field
-        Pixels, without the models of all stars.
+        Pixels from which the models of all stars have been subtracted.
     profile, noise, radius
         As for `fit_stars`.
     stars : Stars
-        All stars as they were taken off.
+        All stars as they were subtracted.
     rows : (n,) int ndarray
-        Those to improve.
+        Rows of the stars to improve.
 
     Returns
     -------
     Stars
-        The improved ones.
+        The improved stars.
 
     Notes
     -----
-    Fits in turn, each with the others where they are, take many turns where two stars share most of
-    their pixels.  Here the steps :math:`\delta` of all solve
+    If two stars share most of their pixels, fitting one star at a time converges slowly.  Here the
+    steps :math:`\delta` of all stars solve
 
     .. math::
         N_{ii} \delta_i + \sum_j N_{ij} \delta_j = g_i
@@ -113,7 +113,7 @@ def joint_step(field, profile, noise, stars, rows, radius):
     basis = profile.evaluate(some.x - xc, some.y - yc, half, profile.shares(some.x, some.y))
     pixels += some.flux[:, None] * basis[0]
     alone, covariance, _ = normal_step(basis, some.flux, pixels, use, sky, noise)
-    # In units of the steps' errors; singular ones stay.
+    # In units of the errors of the steps; singular stars do not move.
     error = np.sqrt(np.einsum("sii->si", covariance))
     singular = ~np.isfinite(error).all(axis=1)
     error[singular], covariance[singular] = 1.0, np.eye(3)

@@ -1,4 +1,4 @@
-"""Small changes of a profile: more or less blur, light on one side, a companion."""
+"""Small changes of a profile: more or less blur, asymmetry, a companion."""
 
 import numpy as np
 
@@ -7,22 +7,22 @@ from wpdc_gwcs.centroids._profile import Profile, shift_matrix, spline_coefficie
 
 __all__ = ["blur_modes", "companions", "mode_profiles", "odd_modes", "reduced_normal"]
 
-# Pixels further off the model than this many sigma weigh as if they were there.
+# Pixels that deviate by more than this many sigma have the weight of pixels at this limit.
 _HUBER = 3.0
 
-# Places of companions: distance in FWHM, and directions.
+# Positions of companions: distance in FWHM, and number of directions.
 _DISTANCE, _N_ANGLES = 0.6, 12
 
 
 def blur_modes(coefficients, scale):
-    """Change of a profile by a little more blur, along x, xy, y, and in the next order.
+    """Compute the change of a profile by a little more blur along x, xy, y, and in the next order.
 
     Parameters
     ----------
     coefficients : (M, M) ndarray
         Spline coefficients of the profile.
     scale : float
-        Grid steps that make an amplitude of one, about the FWHM.
+        Grid steps for an amplitude of one, about the FWHM.
 
     Returns
     -------
@@ -40,7 +40,7 @@ def blur_modes(coefficients, scale):
 
 
 def odd_modes(coefficients, scale):
-    """Change of a profile by a little more light on one side, in the directions there are.
+    """Compute the change of a profile by a little more light on one side, in all directions.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def odd_modes(coefficients, scale):
 
 
 def companions(coefficients, modes, scale):
-    """Change of a profile by the light of a companion, in modes and what no shift or flux makes.
+    """Compute the change of a profile by a companion, as amplitudes of modes.
 
     Parameters
     ----------
@@ -69,7 +69,8 @@ def companions(coefficients, modes, scale):
     Returns
     -------
     (R, K) ndarray
-        Amplitudes of the modes for each of K places of a companion as bright as the star.
+        Amplitudes of the modes, free of shifts and changes of flux, for each of K positions of a
+        companion as bright as the star.
     """
     size = len(coefficients)
     angle = 2 * np.pi * np.arange(_N_ANGLES) / _N_ANGLES
@@ -100,7 +101,7 @@ def _second(c, axis, scale):
 
 
 def mode_profiles(modes, oversampling):
-    """Profiles of modes, to be evaluated like others.
+    """Make profiles of modes, which are evaluated like other profiles.
 
     Parameters
     ----------
@@ -124,13 +125,13 @@ def reduced_normal(field, profile, noise, stars, modes, radius, *, subtracted=Fa
     Parameters
     ----------
     field, profile, noise, stars, radius
-        As for `fit_stars`; stars where the fit has converged.
+        As for `fit_stars`, with stars whose fit has converged.
     modes : list of (M, M) ndarray
         K modes, see `blur_modes`.
     subtracted : bool, optional
-        Whether the models of all stars have been taken off the image.
+        Whether the models of all stars have been subtracted from the image.
     robust : bool, optional
-        Whether pixels far off the model weigh less.
+        Whether pixels that deviate strongly from the model have less weight.
 
     Returns
     -------

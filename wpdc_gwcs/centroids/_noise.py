@@ -1,4 +1,4 @@
-"""Noise of the pixels of stars: sky, photons, and what the profile does not describe."""
+"""Noise of the pixels of stars: sky, photons, and errors of the profile."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -10,19 +10,19 @@ from wpdc_gwcs.centroids._inverses import inverses
 
 __all__ = ["Noise", "NoiseBins", "bin_noise", "bin_odd_noise", "estimate_noise", "least_gain"]
 
-# Error of the profile below which nobody's data can tell.
+# Smallest error of the profile that data could show.
 _MIN_MISMATCH = 0.0005
 
-# Median of a chi square with four degrees of freedom, for each of them; stars in a bin.
+# Median of a chi square with four degrees of freedom, divided by four; number of stars in a bin.
 _MEDIAN_OF_FOUR, _STARS_OF_BIN = 0.839, 15
 
-# Noise of stars shows where it is so many times that of the sky, in so many bins.
+# The noise of stars is visible if it is this many times that of the sky, in this many bins.
 _ABOVE_SKY, _MIN_BINS = 2.0, 3
 
 
 @dataclass(frozen=True)
 class Noise:
-    r"""Variance of a pixel: background, photons, and what the profile does not describe.
+    r"""Variance of a pixel: background, photons, and the error of the profile.
 
     Parameters
     ----------
@@ -31,17 +31,18 @@ class Noise:
     mismatch : float
         Error of the profile at its peak, relative to its value there.
     asymmetry : float or None
-        That part of it that is odd about the star; None for all of it.
+        Part of this error that is odd about the star; None for all of it.
 
     Notes
     -----
     :math:`\sigma^2 = \sigma_\mathrm{sky}^2 + m / g + \epsilon^2 m m_\mathrm{peak}` with m the
-    model's counts.  The error of the profile has the form of photon noise, so that the brightest
-    stars are fitted with the same relative weights as those with photon noise alone; the same
-    relative error everywhere would shift them by whatever asymmetry the wings have.
+    counts of the model.  The error of the profile has the form of photon noise, so the brightest
+    stars are fitted with the same relative weights as stars with photon noise alone.  With the same
+    relative error everywhere, an asymmetry of the wings would shift them.
 
-    An error of the width, or of any ring about the star, makes the fit worse and moves nobody: the
-    derivatives by the position are odd about the star, and the sums with what is even vanish.
+    An error of the width, or of any ring about the star, makes the fit worse but does not shift the
+    star, because the derivatives with respect to the position are odd about the star: their sums
+    with an even error vanish.
     """
 
     inverse_gain: float = 0.0
@@ -50,12 +51,12 @@ class Noise:
 
     @property
     def of_positions(self):
-        """The noise that moves stars, for the weights and errors of their positions."""
+        """Noise that shifts stars, for the weights and errors of their positions."""
         odd = self.mismatch if self.asymmetry is None else self.asymmetry
         return Noise(self.inverse_gain, odd)
 
     def variance(self, sky, model):
-        """Variance for pixels of given sky and model counts."""
+        """Variance of pixels with given sky and model counts."""
         model = np.maximum(model, 0)
         peak = model.max(axis=-1, keepdims=True)
         return sky.variance + model * (self.inverse_gain * sky.photons + self.mismatch**2 * peak)
@@ -69,12 +70,12 @@ class NoiseBins(NamedTuple):
     measured : (B,) ndarray
         Variance of the residuals.
     sky : (B,) ndarray
-        That of the background.
+        Variance of the background.
     photons : (B,) ndarray
-        Counts of the stars: times the counts per electron, the variance of their photons.
+        Counts of the stars.  Multiplied by the counts per electron, this is the photon variance.
     square : (B,) ndarray
-        Counts times those of the star's peak: times the square of the relative error of the
-        profile, the variance that it brings.
+        Counts times those at the peak of the star.  Multiplied by the square of the relative error
+        of the profile, this is the variance from that error.
     """
 
     measured: np.ndarray
@@ -89,16 +90,16 @@ def bin_noise(field, profile, noise, stars, *, radius, modes=(), own=None):
     Parameters
     ----------
     field, profile, noise, stars, radius
-        As for `fit_stars`; stars where the fit has converged.
+        As for `fit_stars`, with stars whose fit has converged.
     modes : sequence of Profile, optional
-        Changes of the profile that each star may have for its own: what they take up is no noise.
+        Changes of the profile that are fitted to each star and do not count as noise.
     own : Stars, optional
         Models that were subtracted from the image, as for `fit_stars`.
 
     Returns
     -------
     NoiseBins or None
-        The bins; None where there are too few pixels.
+        The bins; None if there are too few pixels.
     """
     half = int(np.ceil(radius))
     xc, yc, pixels, use, sky = field.cut(stars, half, radius)
@@ -117,7 +118,7 @@ def bin_noise(field, profile, noise, stars, *, radius, modes=(), own=None):
     normal = (jacobian * weight[:, None]) @ jacobian.transpose(0, 2, 1)
     good = use.sum(axis=1) >= 2 * n
     normal[~good] = np.eye(n)
-    # A fit takes part of the scatter away, most where few pixels decide: the leverage.
+    # A fit absorbs part of the scatter, most where few pixels decide: the leverage.
     inverse = inverses(normal)
     leverage = weight * np.einsum("sip,sij,sjp->sp", jacobian, inverse, jacobian)
     residual = pixels - model
@@ -138,7 +139,7 @@ def bin_noise(field, profile, noise, stars, *, radius, modes=(), own=None):
 
 
 def _medians(values, n_bins):
-    """Medians (..., n_bins) of values (..., N) in bins of as many each, the first ones one more."""
+    """Medians (..., n_bins) of values (..., N) in equally filled bins."""
     size, more = divmod(values.shape[-1], n_bins)
     split = more * (size + 1)
     parts = values[..., :split], values[..., split:]
@@ -153,27 +154,27 @@ def _medians(values, n_bins):
 
 
 def bin_odd_noise(field, profile, noise, stars, modes, *, radius, own=None):
-    r"""Measure the noise in what is odd about well measured stars, as the shift of a star is.
+    r"""Measure the noise of well measured stars that is odd about them, as a shift is.
 
     Parameters
     ----------
     field, profile, stars, radius, own
         As for `bin_noise`.
     noise : Noise
-        Its photons count.
+        Noise; only its photons are used.
     modes : sequence of Profile
         Four changes of the profile that are odd about the star.
 
     Returns
     -------
     NoiseBins or None
-        Variances in units of those by sky and photons; None where there are too few stars.
+        Variances in units of those of sky and photons; None if there are too few stars.
 
     Notes
     -----
     The amplitudes of the modes are fitted with position and flux.  Their chi square is that of sky
-    and photons, and grows with the square of the profile's error by :math:`\mathrm{tr}(N^{-1} B) /
-    4`, where N is the normal matrix and B what the form of that error makes of it.
+    and photons, plus the square of the error of the profile times :math:`\mathrm{tr}(N^{-1} B) /
+    4`, where N is the normal matrix, and B the same for the form of that error.
     """
     if len(stars.x) < 2 * _STARS_OF_BIN:
         return None
@@ -199,7 +200,7 @@ def bin_odd_noise(field, profile, noise, stars, modes, *, radius, own=None):
     square = np.maximum(model, 0) * model.max(axis=1, keepdims=True)
     error = (weighted * square[:, None]) @ weighted.transpose(0, 2, 1)
     square = np.einsum("sij,sji->s", inverse, error) / 4
-    # What all stars have in common shifts them alike, which no star can tell from where it is.
+    # A change that all stars share shifts all of them equally, which cannot be noticed.
     share = 1 / (1 + noise.mismatch**2 * square)
     common = np.linalg.pinv(np.einsum("s,sij->ij", share, left)) @ (share @ right)
     right -= left @ common
@@ -212,14 +213,14 @@ def bin_odd_noise(field, profile, noise, stars, modes, *, radius, own=None):
 
 
 def estimate_noise(bins, gain=None):
-    """Learn from the noise in stars how far the profile is off, and the gain.
+    """Determine the error of the profile and the gain from the noise in stars.
 
     Parameters
     ----------
     bins : NoiseBins or None
         As from `bin_noise`.
     gain : float, optional
-        Electrons per count; estimated if not given.
+        Electrons per count.  Default: estimated.
 
     Returns
     -------
@@ -234,8 +235,8 @@ def estimate_noise(bins, gain=None):
         photons = bins.photons * np.exp(logs[1]) if gain is None else 0.0
         return known + photons + np.exp(2 * logs[0]) * bins.square
 
-    # Ratios, not differences: a variance is uncertain in proportion to itself; and robustly, for
-    # galaxies among the stars.
+    # Ratios, not differences, because the error of a variance is proportional to it; and a robust
+    # fit, because there may be galaxies among the stars.
     start = [np.log(0.02)]
     start += [np.log(0.1 * np.median(bins.sky / bins.photons))] if gain is None else []
     logs = least_squares(
@@ -253,7 +254,7 @@ def estimate_noise(bins, gain=None):
 
 
 def least_gain(bins):
-    """Find the gain below which photons alone would make more noise than there is.
+    """Find the gain below which photons alone would make more noise than observed.
 
     Parameters
     ----------
@@ -263,7 +264,7 @@ def least_gain(bins):
     Returns
     -------
     float
-        Electrons per count; 0 where the noise of the stars does not show above that of the sky.
+        Electrons per count; 0 if the noise of the stars is not visible above that of the sky.
     """
     if bins is None:
         return 0.0

@@ -1,4 +1,4 @@
-"""Profiles as models of photutils, which takes half a second to import, and back."""
+"""Conversion between profiles and models of photutils, which takes half a second to import."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ __all__ = ["from_photutils", "to_photutils"]
 
 
 def to_photutils(profile):
-    """Give a profile as a model of photutils.
+    """Convert a profile to a model of photutils.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def to_photutils(profile):
 
 
 def from_photutils(epsf):
-    """Take the profile of a model of photutils.
+    """Convert a model of photutils to a profile.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def from_photutils(epsf):
     Raises
     ------
     ValueError
-        If the model has no odd square grid, or its places make none.
+        If the grid of the model is not square with odd sides, or its places do not form a grid.
     """
     if isinstance(epsf, Profile):
         return epsf

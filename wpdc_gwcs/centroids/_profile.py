@@ -20,7 +20,7 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    r"""An effective PSF: the share of a star's flux that falls into a pixel, by offset.
+    r"""Effective PSF: the fraction of the flux of a star in a pixel, as a function of the offset.
 
     Parameters
     ----------
@@ -33,14 +33,14 @@ class Profile:
 
     Notes
     -----
-    With k the oversampling, :math:`c = (M - 1) / 2`, and u, v pixel minus star,
+    With k the oversampling, :math:`c = (M - 1) / 2`, and u, v the offset of a pixel from the star,
 
     .. math::
         \psi(u, v) = \sum_{qp} C_{qp} B_3(k u + c - p) B_3(k v + c - q) .
 
-    All pixels of a star fall onto the same phase of the grid.  For the stars that share the grid
-    cell, the pixels of all of them are therefore one matrix product, of the 16 spline weights of
-    every star with a table of coefficients.
+    All pixels of a star have the same phase with respect to the grid.  For all stars with the same
+    grid cell, the pixels are therefore a single matrix product of the 16 spline weights of each
+    star with a table of coefficients.
     """
 
     coefficients: np.ndarray
@@ -50,13 +50,13 @@ class Profile:
 
     @classmethod
     def constant(cls, samples, oversampling):
-        """Profile through samples on the grid, the same all over the detector."""
+        """Make a profile from samples on the grid, constant over the detector."""
         zero = np.zeros(1)
         return cls(spline_coefficients(samples)[None], oversampling, zero, zero)
 
     @property
     def radius(self):
-        """Greatest whole number of pixels from the star at which the profile is defined."""
+        """Greatest distance from the star, in whole pixels, at which the profile is defined."""
         return (self.coefficients.shape[-1] - 1) // 2 // self.oversampling
 
     def samples(self):
@@ -66,7 +66,7 @@ class Profile:
         return (c[:, :, :-2] + 4 * c[:, :, 1:-1] + c[:, :, 2:]) / 6
 
     def wobble(self):
-        r"""Find by how much the center of light moves about the star with its place in the pixel.
+        r"""Compute how far the center of light moves about the star with the pixel phase.
 
         Returns
         -------
@@ -76,7 +76,7 @@ class Profile:
         Notes
         -----
         With :math:`\psi_x` the profile summed along the other axis, that is :math:`\sqrt 2\,
-        |\int u\, \psi_x(u)\, e^{-2 \pi i u} du|`: what light there is at one cycle per pixel.
+        |\int u\, \psi_x(u)\, e^{-2 \pi i u} du|`, which measures structure at one cycle per pixel.
         """
         samples = self.samples().mean(axis=0)
         step = (np.arange(len(samples)) - self._center) / self.oversampling
@@ -87,10 +87,10 @@ class Profile:
 
     @cached_property
     def _components(self):
-        """Few grids of coefficients, and their shares (G, R) in those of all places.
+        """A few grids of coefficients, and their shares (G, R) in the grids of all places.
 
-        Neighboring places differ by a handful of shapes: with these, a star costs the same
-        however many places there are.
+        Neighboring places differ by a few shapes.  With these, the cost of a star does not depend
+        on the number of places.
         """
         n = len(self.coefficients)
         flat = self.coefficients.reshape(n, -1)
@@ -102,13 +102,13 @@ class Profile:
         return right[keep].reshape(-1, *self.coefficients.shape[1:]), shares
 
     def shares(self, x, y):
-        """Shares (N, R) of the component grids for stars at x, y.
+        """Compute the shares (N, R) of the component grids for stars at x, y.
 
         Parameters
         ----------
         x, y : (N,) ndarray
-            Positions in px; between places the profile is interpolated linearly, beyond them it
-            is that of the rim.
+            Positions in px.  Between places, the profile is interpolated linearly; outside, it is
+            that of the nearest edge.
 
         Returns
         -------
@@ -121,7 +121,7 @@ class Profile:
         ) @ self._components[1]
 
     def evaluate(self, dx, dy, half, shares, *, gradient=True):
-        """Profile of each star in the pixels of its cut-out.
+        """Evaluate the profile of each star in the pixels of its cut-out.
 
         Parameters
         ----------
@@ -132,19 +132,19 @@ class Profile:
         shares : (N, R) ndarray
             See `shares`.
         gradient : bool, optional
-            Whether to return the derivatives by the position too.
+            Whether to return the derivatives with respect to the position as well.
 
         Returns
         -------
         (3, N, n) or (1, N, n) ndarray
-            Value and, if asked for, derivatives by x and y, in n = (2 half + 1)^2 pixels.
+            Values and optionally derivatives with respect to x and y, in n = (2 half + 1)^2 pixels.
         """
         result = np.empty((3 if gradient else 1, len(dx), (2 * half + 1) ** 2))
         kernels.star_profiles(*self._numbers(dx, dy, shares), half, result)
         return result
 
     def models(self, x, y, flux, half):
-        """Make models of stars, which can be drawn.
+        """Make models of stars that can be drawn.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class Models:
         image : (n, nx) float32 ndarray
             Rows of the image.
         first_row : int, optional
-            The first of them.
+            Number of the first row.
         """
         ends = [first_row - self.half, first_row + len(image) + self.half]
         k = slice(*np.searchsorted(self.center[:, 1], ends))
@@ -220,7 +220,7 @@ class Models:
 
 
 def spline_taps(position):
-    """First knot, the four weights and their slopes of cubic B-splines at positions in grid steps.
+    """Compute the four weights of cubic B-splines, and their slopes, at positions in grid steps.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def spline_taps(position):
     base : (N,) int ndarray
         Knot below; the weights are those of knots base - 1 to base + 2.
     weights, slopes : (N, 4) ndarray
-        Values of the splines, and their derivatives by the position.
+        Values of the splines, and their derivatives with respect to the position.
     """
     base = np.floor(position)
     t = position - base
@@ -251,7 +251,7 @@ def spline_taps(position):
 
 
 def spline_coefficients(samples):
-    """Coefficients of the cubic B-splines through samples (..., M, M); zero outside.
+    """Compute the coefficients of the cubic B-splines through samples, which are zero outside.
 
     Parameters
     ----------
@@ -288,7 +288,7 @@ def moffat_samples(shape, half, oversampling):
         Samples, M = 2 half oversampling + 1.
     """
     width, beta = np.exp(shape[0]), 1 + np.exp(shape[1])
-    # Points within a pixel: enough for cores well below a pixel.
+    # Number of points within a pixel: enough for cores much narrower than a pixel.
     fine = 4
     n = (half + 1) * oversampling * fine
     u = np.arange(-n, n + 1) / (oversampling * fine)
@@ -299,7 +299,7 @@ def moffat_samples(shape, half, oversampling):
     values = (1 + r2 * (2 ** (1 / beta) - 1) / width**2) ** -beta
     box = oversampling * fine
     for axis in (0, 1):
-        # An even number of points: the mean of both ways to center the box.
+        # With an even number of points, take the mean of both ways to center the box.
         values = 0.5 * (
             uniform_filter1d(values, box, axis=axis)
             + uniform_filter1d(values, box, axis=axis, origin=-1)
@@ -311,14 +311,14 @@ def moffat_samples(shape, half, oversampling):
 
 
 def shift_matrix(size, shift):
-    """Make the matrix from spline coefficients to values on a grid that is moved.
+    """Make the matrix from spline coefficients to values on a shifted grid.
 
     Parameters
     ----------
     size : int
         Number of coefficients.
     shift : float
-        Grid steps by which the grid is moved.
+        Shift of the grid, in grid steps.
 
     Returns
     -------

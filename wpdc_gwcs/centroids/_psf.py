@@ -1,4 +1,4 @@
-"""The profile of a frame: constant or varying, of one width or with finer structure."""
+"""The profile of a frame: constant or varying, smooth or with finer structure."""
 
 import logging
 
@@ -17,17 +17,17 @@ __all__ = ["MIN_STARS", "learn_psf"]
 
 log = logging.getLogger(__name__)
 
-# Stars without which there is no profile.
+# Least number of stars for a profile.
 MIN_STARS = 8
-# Error of the PSF, relative, up to which it is as smooth as its width tells; and the FWHM in px of
-# the finest structure looked for otherwise.
+# Up to this relative error, the PSF is as smooth as its width suggests; otherwise, structure down
+# to this FWHM in px is fitted.
 _FAIR_MISMATCH = 0.03
 _FINEST = 1.4
-# Share of broad stars that is not chance.
+# Fraction of broad stars above which they are not due to chance.
 _BROAD_SHARE = 0.04
-# Chi square of left-out stars, relative, from which a varying PSF is better than a constant one.
+# A varying PSF is better if the chi square of left-out stars is below this, relative to a constant.
 _BETTER = 0.99
-# Stars from which the PSF may vary as a polynomial of degree 1, 2, 3 over the detector.
+# Numbers of stars from which on the PSF may vary as a polynomial of degree 1, 2, 3.
 _STARS_FOR_DEGREE = (30, 60, 200)
 
 
@@ -51,7 +51,7 @@ def learn_psf(field, stars, fwhm, gain, vary):
     Returns
     -------
     Profile or None
-        None if the fits fail.
+        The profile; None if the fits fail.
     """
     half = int(np.clip(np.ceil(3 * fwhm), 6, 20)) + 1
     noise = Noise(0.0 if gain is None else 1 / gain, 0.03)
@@ -71,7 +71,7 @@ def learn_psf(field, stars, fwhm, gain, vary):
 
 
 def _learn_constant(field, noise, chosen, start, options):
-    """One profile for all places, its stars, its noise and the width in px of its structure."""
+    """Constant profile, its stars, its noise and the width in px of its structure."""
     fwhm, radius = options["fwhm"], options["radius"]
     profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=4, **options)
     broad, _ = judge_profiles(field, profile, noise, stars, stars.flux > 0, fwhm, radius)
@@ -81,7 +81,7 @@ def _learn_constant(field, noise, chosen, start, options):
         profile, stars, noise = learn_profile(field, noise, chosen, start, iterations=2, **options)
     finest = best = fwhm
     while noise.mismatch > _FAIR_MISMATCH and finest > 2 * _FINEST:
-        # Rings and trails have edges that are finer than they are wide.
+        # Rings and trails have edges that are sharper than their width suggests.
         finest = max(0.25 * finest, _FINEST)
         finer = options | {"iterations": 4, "finest": finest}
         found = learn_profile(field, noise, chosen, profile, **finer)
@@ -93,12 +93,12 @@ def _learn_constant(field, noise, chosen, start, options):
 
 
 def _learn_varying(field, noise, stars, profile, options):
-    """Profile that varies over the detector if that is better, and its stars."""
+    """Profile, which varies over the detector if that is better, and its stars."""
     n, fwhm, radius = len(stars.x), options["fwhm"], options["radius"]
     kind = {"radius": radius + 0.5 * fwhm, "degree": int(np.searchsorted(_STARS_FOR_DEGREE, n))}
     if kind["degree"] == 0:
         return profile, stars
-    # Every fifth star, by brightness, is left out to judge by.
+    # Every fifth star, by brightness, is left out for the test.
     left_out = np.arange(n) % 5 == 2
     tried = [profile, vary_profile(field, noise, stars.take(~left_out), profile, fwhm, **kind)]
     chi2 = [
@@ -106,7 +106,7 @@ def _learn_varying(field, noise, stars, profile, options):
         for p in tried
     ]
     log.debug("chi2 of left-out stars: constant PSF %.3f, varying PSF %.3f", *chi2)
-    # More freedom only where it brings something.
+    # More freedom only if it improves the fit.
     if not chi2[1] < _BETTER * chi2[0]:
         return profile, stars
     varying = vary_profile(field, noise, stars, profile, fwhm, **kind)

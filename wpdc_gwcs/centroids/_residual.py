@@ -11,27 +11,27 @@ from wpdc_gwcs.centroids._profile import Profile
 
 __all__ = ["Painter", "Residual", "Scene"]
 
-# Pixels that are worked on at a time: many, where stars are cut out of them, and as many as stay in
-# the cache of a processor, where they are not.
+# Number of pixels processed at a time: many where cut-outs of stars are made, otherwise as many as
+# fit into the cache of a processor.
 _STRIP, _CACHED = 3_000_000, 250_000
 
-# Half-widths in px that stars are drawn with, up to that of the profile: faint ones are smaller.
+# Half widths in px with which stars are drawn, up to that of the profile; faint stars are smaller.
 _SIZES = (3, 5, 8, 12, 20)
 # Light in the wings that may be left out, in standard deviations of the sky.
 _FAINTEST = 0.1
 
-# Light of neighbors, in standard deviations of the sky, that does not matter to a fit; and relative
+# Light of neighbors that does not matter to a fit, in standard deviations of the sky, and relative
 # to the light in the pixel.
 _NEGLIGIBLE, _SHARE = 0.05, 0.01
 # The same for a change of that light.
 _SETTLED = 0.02
 
-# Error of the PSF, relative, below which a residual is no sign of another star.
+# Relative error of the PSF: smaller residuals are no sign of another star.
 _MODEL_ERROR = 0.1
 
 
 class Painter:
-    """Makes models of stars, each as large as its light can be told from the noise.
+    """Maker of models of stars, each drawn as far as its light exceeds the noise.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Painter:
         samples = np.abs(profile.samples()).max(axis=0)
         center = samples.shape[0] // 2
         full = profile.radius - 1
-        # Greatest value at or beyond every distance along the axes.
+        # Greatest value of the profile at or beyond each distance along the axes.
         distance = np.abs(np.arange(samples.shape[0]) - center) / profile.oversampling
         line = np.maximum(samples[center], samples[:, center])
         self._sizes = np.unique(np.minimum([*_SIZES, full], full))
@@ -76,12 +76,12 @@ class Painter:
         Parameters
         ----------
         stars : Stars
-            The stars; a negative flux takes light off.
+            The stars; a negative flux subtracts light.
 
         Returns
         -------
         list of Models
-            Those of each size.
+            Models, one entry for each size.
         """
         half = self.half(stars.flux)
         groups = (stars.take((half == size) & (stars.flux != 0)) for size in self._sizes)
@@ -98,7 +98,7 @@ def _paint(image, models, first_row):
 
 
 class Scene:
-    """An image from which the models of stars are taken off as they are found.
+    """Image from which the models of stars are subtracted as they are found.
 
     Parameters
     ----------
@@ -107,11 +107,11 @@ class Scene:
     profile : Profile
         The PSF.
     drawn : Stars
-        The stars whose models have been taken off; flux 0 for those without.
+        The stars whose models have been subtracted; the flux is 0 for stars without a model.
 
     Notes
     -----
-    Only what has changed is drawn, in strips: there is no image of all models.
+    Only changes are drawn, in strips, so no image of all models is needed.
     """
 
     def __init__(self, data, profile, drawn):
@@ -121,16 +121,17 @@ class Scene:
 
     @property
     def own(self):
-        """Models that stars get back for their fits, None where nothing has been taken off."""
+        """Models that are added back to stars for their fits; None if none was subtracted."""
         return self.drawn if self.drawn.flux.any() else None
 
     def draw(self, stars, radius):
-        """Take stars off the image instead of what they were before.
+        """Subtract the new models of stars from the image instead of the old ones.
 
         Parameters
         ----------
         stars : Stars
-            The same stars with new positions and fluxes; flux 0 for those that are not drawn.
+            The same stars with new positions and fluxes; the flux is 0 for stars that are not
+            drawn.
         radius : float
             Radius in px of the pixels of a fit.
 
@@ -172,7 +173,7 @@ class Scene:
         return np.sort(np.concatenate(found))
 
     def _disturbed(self, light, low, old, new, changed, radius, settled):
-        """Mark the stars in whose pixels there is light that is not their own."""
+        """Mark the stars that have light of other stars in their pixels."""
         half = int(np.ceil(radius))
         part = self.field.rows(low, low + len(light), image=light)
         at = new._replace(y=new.y - low)
@@ -188,7 +189,7 @@ class Scene:
 
 
 def _lit_rows(models, n_rows):
-    """Mark the rows of an image that any of the models has light in."""
+    """Mark the rows of an image that have light of any of the models."""
     change = np.zeros(n_rows + 1, int)
     for one in models:
         row = one.center[:, 1].astype(int)
@@ -198,13 +199,13 @@ def _lit_rows(models, n_rows):
 
 
 def _runs(marks):
-    """Find where each run of marks begins, and the place behind its end."""
+    """Find the start of each run of marks, and the position after its end."""
     edges = np.flatnonzero(np.diff(marks, prepend=False, append=False))
     return edges.reshape(-1, 2)
 
 
 def _near_any(stars, changed, reach):
-    """Rows of the stars that have another one that has changed within reach along both axes."""
+    """Rows of the stars that have a changed star within reach along both axes."""
     places = np.column_stack([stars.x, stars.y])
     options = {"k": 2, "p": np.inf, "distance_upper_bound": reach}
     distance = KDTree(places[changed]).query(places, **options)[0]
@@ -213,7 +214,7 @@ def _near_any(stars, changed, reach):
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """An image without its stars, of which parts are made when they are asked for.
+    """Image without its stars, whose parts are made on request.
 
     Parameters
     ----------
@@ -226,7 +227,7 @@ class Residual:
     gain : float or None
         Electrons per unit of the image.
     subtracted : bool
-        Whether the models have been taken off the image already.
+        Whether the models have already been subtracted from the image.
     """
 
     background: object
@@ -250,13 +251,13 @@ class Residual:
         Parameters
         ----------
         start, stop : int
-            The first row, and the one behind the last.
+            First row, and the row after the last.
 
         Returns
         -------
         Background
-            The residual image.  Its ``rms`` is that of the background, of the stars' photons and
-            of an error of the PSF by 10 %: what stands out of it is no residual of a known star.
+            The residual image.  Its ``rms`` includes the background, the photons of the stars and
+            an error of the PSF of 10 %, so what exceeds it is not a residual of a known star.
         """
         part = self.background.rows(start, stop)
         image = part.image if self.subtracted else np.empty_like(part.image)

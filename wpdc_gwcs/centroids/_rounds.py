@@ -1,4 +1,4 @@
-"""Fits of all stars, their neighbors' light taken off, and what the neighbors cost."""
+"""Fits of all stars, without the light of their neighbors, and the effect of the neighbors."""
 
 import logging
 from dataclasses import replace
@@ -19,25 +19,25 @@ __all__ = ["MAX_CHI2", "fit_all", "judge_neighbors", "near", "noise_bins"]
 
 log = logging.getLogger(__name__)
 
-# Stars whose residuals tell the error of the PSF.
+# Number of stars whose residuals show the error of the PSF.
 _MAX_STARS = 1000
 _ENOUGH_ALONE = 50
-# Reduced chi square, absolute and relative to that of sources as bright, from which a source is
-# not a star.
+# Above this reduced chi square, absolute and relative to that of sources of similar brightness, a
+# source is not a star.
 MAX_CHI2 = 4.0
-# Relative error of a neighbor's light beside its core: what any PSF is known to at best, what that
-# of a saturated star is, whose flux comes from its wings, and that of a source that has no model.
+# Relative error of the light of a neighbor outside its core: at best, for any PSF; for a saturated
+# star, whose flux comes from its wings; and for a source without a model.
 _LEAST_ERROR, _SATURATED_ERROR, _NO_MODEL = 0.02, 0.2, 1.0
-# Steps together before any star is fitted again: a companion that was found in what a fit had left
-# of it would lose its place beside a star that has taken half of its light.
+# Number of joint steps before stars are fitted again one by one.  A companion that was found in the
+# residuals would otherwise lose its position next to a star that has absorbed half of its light.
 _FIRST_STEPS = 2
-# Signal-to-noise ratio of stars from which companions under them show.
+# Least signal-to-noise ratio of stars for the search for hidden companions.
 _LEAST_SNR = 15.0
-# Distance from the edge of the image, in FWHM, from which the fit of a star is as good as its error
-# says, though its core reaches over the edge.
+# Least distance from the edge of the image, in FWHM, at which the error of a fit is correct
+# although the core of the star reaches over the edge.
 _INSIDE = 0.3
-# A star is blended where its neighbors cost it more than this many times the error it would have
-# alone, and more than so many px.
+# A star is blended if its neighbors add more than this many times the error that it would have
+# alone, and more than this many px.
 _MAX_COST, _TOLERATED_COST = 1.5, 0.01
 
 
@@ -64,14 +64,14 @@ def noise_bins(field, profile, stars, quality, fwhm, gain, *, own=None):
     bins : NoiseBins or None
         As from `bin_noise`.
     clean : Stars
-        The stars that they are of, as fitted.
+        Stars in the bins, as fitted.
     own : Stars or None
-        Their models that were subtracted.
+        Models of these stars that were subtracted.
     """
     radius = fit_radius(fwhm)
     noise = Noise(0.0 if gain is None else 1 / gain)
     good = quality & (stars.flux > 0)
-    # Neighbors' light is no noise, if enough stars have none.
+    # Stars with light of neighbors are left out if there are enough others.
     alone = good & isolated(stars, fwhm)
     rows = np.flatnonzero(alone if alone.sum() >= _ENOUGH_ALONE else good)
     rows = rows[np.argsort(stars.flux[rows])[::-1][:_MAX_STARS]]
@@ -79,7 +79,7 @@ def noise_bins(field, profile, stars, quality, fwhm, gain, *, own=None):
     fits = fit_stars(field, profile, noise, stars.take(rows), radius=radius, own=own)
     alike = star_like(fits.stars.flux, fits.chi2, fits.valid)
     clean, own = fits.stars.take(alike), None if own is None else own.take(alike)
-    # A star that is a little broader or sharper than others has no worse position.
+    # The position of a star is no worse if it is a little broader or sharper than others.
     blur = blur_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)
     modes = mode_profiles(blur[:3], profile.oversampling)
     bins = bin_noise(field, profile, noise, clean, radius=radius, modes=modes, own=own)
@@ -87,7 +87,7 @@ def noise_bins(field, profile, stars, quality, fwhm, gain, *, own=None):
 
 
 def _with_asymmetry(noise, field, profile, stars, own, fwhm):
-    """Noise that knows what part of the profile's error is odd about the star."""
+    """Noise with the part of the error of the profile that is odd about the star."""
     odd = odd_modes(profile.coefficients.mean(axis=0), fwhm * profile.oversampling)
     modes = mode_profiles(odd, profile.oversampling)
     radius = fit_radius(fwhm)
@@ -100,31 +100,31 @@ def _with_asymmetry(noise, field, profile, stars, own, fwhm):
 
 @one_blas_thread
 def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
-    """Fit all stars, and improve those that share pixels together.
+    """Fit all stars, and jointly improve those that share pixels.
 
     Parameters
     ----------
     scene : Scene
-        The pixels; in the end without the stars.
+        The pixels; on return without the stars.
     profile : Profile
         The PSF.
     stars : Stars
         Start values.
     quality : (N,) ndarray of bool
-        True for stars of good quality, which tell the noise.
+        True for stars of good quality, from which the noise is measured.
     fwhm : float
         FWHM in px.
     gain : float or None
         Electrons per unit of the image.
     passes : int
-        Rounds at most.
+        Greatest number of rounds.
     refit : bool
-        Whether neighbors are taken off from the first round on.
+        Whether neighbors are subtracted from the first round on.
 
     Returns
     -------
     fits : StarFits
-        The fits, each with the covariance of the star alone.
+        The fits; each has the covariance of the star alone.
     noise : Noise
         Noise of the pixels.
     """
@@ -156,7 +156,7 @@ def fit_all(scene, profile, stars, quality, fwhm, gain, passes, refit):
 
 
 def _step_together(scene, profile, noise, fits, start, rows, fwhm):
-    """Fits after a step of some stars together, and the rows beside which that changes light."""
+    """Fits after a joint step of some stars, and the rows whose pixels that changes."""
     radius = fit_radius(fwhm)
     rows = rows[scene.drawn.flux[rows] > 0]
     if len(rows) == 0:
@@ -167,14 +167,14 @@ def _step_together(scene, profile, noise, fits, start, rows, fwhm):
 
 
 def _fit_again(scene, profile, noise, start, rows, radius):
-    """Fits of some stars, the others where they are."""
+    """Fits of some stars, with the others unchanged."""
     own = None if scene.own is None else scene.own.take(rows)
     return fit_stars(scene.field, profile, noise, start, radius=radius, own=own)
 
 
 @one_blas_thread
 def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
-    """Find what neighbors and edges cost the fits, and which sources are broader than a star.
+    """Find the effect of neighbors and edges on the fits, and sources broader than a star.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
     fits : StarFits
         The fits.
     start : Stars
-        Where they began.
+        Start values of the fits.
     flags : (N,) ndarray of int
         Flags of the sources.
     fwhm : float
@@ -196,9 +196,9 @@ def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
     Returns
     -------
     fits : StarFits
-        With the covariance of all stars together.
+        The fits with the covariance of a fit of all stars together.
     shift : (N,) ndarray
-        Error of the positions in px by what is wrong in the models of neighbors.
+        Error of the positions in px from errors of the models of neighbors.
     flags : (N,) ndarray of int
         Flags.
     """
@@ -234,25 +234,25 @@ def judge_neighbors(scene, profile, noise, fits, start, flags, fwhm):
 
 
 def _modelled(fits, start, fwhm):
-    """Stars as fitted; without a flux, and where they were, those without a fit."""
+    """Stars as fitted; those without a fit keep their positions and have no flux."""
     good = fits.valid & near(fits.stars, start, fwhm)
     x, y, flux = (np.where(good, new, old) for new, old in zip(fits.stars, start, strict=True))
     return Stars(x, y, np.where(good, flux, 0.0))
 
 
 def near(stars, start, fwhm):
-    """Mark the fits that stayed with the source they began at.
+    """Mark the fits that stayed with the source where they began.
 
     Parameters
     ----------
     stars, start : Stars
-        As fitted, and where the fits began.
+        Fitted stars, and start values.
     fwhm : float
         FWHM in px.
 
     Returns
     -------
     (N,) ndarray of bool
-        True for those that did.
+        True for fits that stayed.
     """
     return np.hypot(stars.x - start.x, stars.y - start.y) < max(0.5 * fwhm, 1.0)

@@ -1,4 +1,4 @@
-"""How the PSF varies over the detector, as polynomials of small changes."""
+"""Variation of the PSF over the detector, as polynomials of small changes."""
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
@@ -9,11 +9,11 @@ from wpdc_gwcs.centroids._profile import Profile
 
 __all__ = ["vary_profile"]
 
-# Places along each axis at which a varying profile is tabulated.
+# Number of places along each axis at which a varying profile is tabulated.
 _N_NODES = 5
 
-# Inverse square of the size of a group of amplitudes: of order one, which would be a different
-# star, and so small that nobody could tell; rounds at most to find it.
+# Limits of the inverse square of the size of a group of amplitudes, from order one (a completely
+# different profile) to unnoticeable; greatest number of rounds to find it.
 _LEAST_PRECISION, _MOST_PRECISION = 10.0, 1e10
 _MAX_ROUNDS = 100
 
@@ -32,30 +32,31 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
     fwhm : float
         FWHM in px.
     radius : float
-        Radius in px of the pixels used.
+        Radius in px of the pixels that are used.
     degree : int
         Degree of the polynomials in position.
 
     Returns
     -------
     Profile
-        Profile with places all over the detector.
+        Profile with places over the whole detector.
 
     Notes
     -----
-    A little more or less blur changes a profile by its second derivatives, and by its fourth in
-    the next order:
+    A little more or less blur changes a profile by its second derivatives and, in the next order,
+    by its fourth derivatives:
 
     .. math::
         \psi(u, v; X, Y) = \psi + a_1 \psi_{uu} + a_2 \psi_{uv} + a_3 \psi_{vv}
                             + a_4 \nabla^4 \psi
 
-    with polynomials :math:`a_k(X, Y)`.  Coma, which grows off the axis of any telescope, changes
-    the third derivatives.  None of these has a first moment: the meaning of the position stays the
-    same all over the detector.
+    with polynomials :math:`a_k(X, Y)`.  Coma, which grows with the distance from the axis of any
+    telescope, changes it by the third derivatives.  None of these terms has a first moment, so the
+    meaning of the position is the same over the whole detector.
 
-    The amplitudes of a kind and a degree have a normal prior, as wide as the data make most likely
-    (empirical Bayes): a free cubic would take noise for coma where stars are few, in the corners.
+    The amplitudes of each kind and degree have a normal prior with the most likely width, given the
+    data (empirical Bayes).  A free cubic would take noise for coma where there are few stars, in
+    the corners.
     """
     scale = fwhm * profile.oversampling
     blur, odd = (f(profile.coefficients[0], scale) for f in (blur_modes, odd_modes))
@@ -66,7 +67,7 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
     k, p = len(modes), terms.shape[1]
     normal = np.einsum("sij,sp,sq->ipjq", left, terms, terms).reshape(k * p, k * p)
     vector = np.einsum("si,sp->ip", right, terms).reshape(k * p)
-    # Blur and asymmetry have a size each, in the terms of each degree.
+    # Blur and asymmetry each have their own size for each degree.
     powers = np.add(*_powers(degree))
     group = np.add.outer(np.repeat([0, degree + 1], [len(blur), len(odd)]), powers).ravel()
     amplitudes = _likely_amplitudes(normal, vector, group).reshape(k, p)
@@ -79,13 +80,13 @@ def vary_profile(field, noise, stars, profile, fwhm, *, radius, degree):
 
 
 def _likely_amplitudes(normal, vector, group):
-    """Amplitudes of the size, group by group, that the data make most likely: empirical Bayes."""
+    """Amplitudes with the most likely size of each group: empirical Bayes."""
     count = np.bincount(group)
     precision = np.full(len(count), _LEAST_PRECISION)
     for _ in range(_MAX_ROUNDS):
         covariance = np.linalg.inv(normal + np.diag(precision[group]))
         amplitudes = covariance @ vector
-        # As many of a group's numbers as the data tell, over their squares.
+        # Number of values of a group that the data determine, divided by the sum of their squares.
         told = count - precision * np.bincount(group, np.diag(covariance))
         square = np.bincount(group, amplitudes**2)
         new = np.clip(told / np.maximum(square, 1e-30), _LEAST_PRECISION, _MOST_PRECISION)

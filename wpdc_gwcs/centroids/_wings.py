@@ -8,37 +8,38 @@ from wpdc_gwcs.centroids._profile import spline_coefficients
 
 __all__ = ["with_wings"]
 
-# Stars that tell, the brightest ones.
+# Number of brightest stars that are used.
 _MAX_STARS = 200
-# Wings reach as far as this many times the profile, or so many px; less far where they are below so
-# much of the sky's noise beside the brightest star, or below so many times their own error.
+# Wings reach to this many times the radius of the profile, or this many px.  They end where they
+# fall below this fraction of the noise of the sky next to the brightest star, or below this many
+# times their own error.
 _REACH, _MOST, _FAINTEST, _SEEN = 3, 30, 0.1, 2.0
-# Error of a median over that of a mean.
+# Error of a median divided by that of a mean.
 _MEDIAN_COST = 1.25
 
 
 def with_wings(field, profile, stars):
-    """Continue a profile outwards by what is around bright stars.
+    """Extend a profile outward with the light around bright stars.
 
     Parameters
     ----------
     field : Field
         Pixels.
     profile : Profile
-        The PSF, known to its rim.
+        The PSF, known out to its rim.
     stars : Stars
-        Clean stars that it was learned from, as fitted.
+        Clean stars from which it was learned, as fitted.
 
     Returns
     -------
     Profile
-        The profile, of the same light within its old rim, with round wings.
+        The profile with round wings; the light within its old rim is unchanged.
 
     Notes
     -----
-    Wings are the medians in rings one pixel wide, which the neighbors of a few stars do not change.
-    The wings of an Airy disk at seven pixels are a few times the noise of the sky beside a bright
-    star: a ring of false companions, if its model ends there.
+    Wings are medians in rings of one pixel, which neighbors of a few stars do not change.  Seven
+    pixels from a bright star, the wings of an Airy disk are a few times the noise of the sky.  If
+    the model ended there, a ring of false companions would be found.
     """
     half = profile.radius - 1
     radius, light = _rings(field, stars, half, max(min(_REACH * half, _MOST), half + 1))
@@ -52,13 +53,13 @@ def with_wings(field, profile, stars):
     old = profile.samples()
     pad = (len(step) - old.shape[-1]) // 2
     old = np.pad(old, ((0, 0), (pad, pad), (pad, pad)))
-    # The old rim is the start's, from which it was not allowed to move.
+    # The old rim is that of the start, which was kept fixed.
     share = np.clip(r - (half - 1), 0, 1)
     return replace(profile, coefficients=spline_coefficients(old + share * (wings - old)))
 
 
 def _rings(field, stars, first, last):
-    """Radii in px of rings, out to where nothing is seen, and the share of a star's light there."""
+    """Radii in px of rings, as far as wings are visible, and the fraction of light in them."""
     stars = stars.take(np.argsort(stars.flux)[::-1][:_MAX_STARS])
     xc, yc, pixels, use, sky = field.cut(stars, last, np.inf)
     step = np.arange(-last, last + 1)

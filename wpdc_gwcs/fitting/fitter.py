@@ -51,8 +51,8 @@ class WPDCFitter(Fitter):
     fit_info : dict
         Results of the last call: ``covariance`` of the free parameters (with ``param_names``),
         ``rank``, ``condition``, ``iterations`` (re-matchings), ``robust_iterations``,
-        ``converged``, ``n_used``, ``used`` (mask of the stars kept), ``rms`` and ``scatter`` of the residuals of
-        each output, ``chi2``, ``residuals`` ``(2, N)``.
+        ``converged``, ``n_used``, ``used`` (mask of the stars kept), ``rms`` and ``scatter`` of the
+        residuals of each output, ``chi2``, ``residuals`` ``(2, N)``.
 
     Raises
     ------

@@ -72,10 +72,10 @@ def solve_literally(
     Notes
     -----
     ``sigma`` of an exposure combines the extrapolated formal error of its polynomial with the
-    scatter of neighboring residuals, which is also the noise of a table through raw residuals.  The scatter
-    includes the differences between the polynomials of the exposures.  ``sigma`` does not include
-    the distortion that the damped steps leave, if it differs between exposures, the error of linear
-    interpolation between nodes, or extrapolation beyond the outermost stars.
+    scatter of neighboring residuals, which is also the noise of a table through raw residuals.  The
+    scatter includes the differences between the polynomials of the exposures.  ``sigma`` does not
+    include the distortion that the damped steps leave, if it differs between exposures, the error
+    of linear interpolation between nodes, or extrapolation beyond the outermost stars.
 
     References
     ----------

@@ -11,9 +11,9 @@ from wpdc_gwcs.robust import robust_sigma
 __all__ = ["build_raw_table", "raw_noise"]
 
 # The paper names `RBFInterpolator` and no options.  Its default, one matrix of all n stars, takes
-# n^2 numbers and n^3 steps: 130 MB and some seconds for this number, 170 GB for the 25 fields of the
-# paper.  For more stars, only so many neighbors are used; 20 and 100 neighbors give the same table
-# to 1 % of its error.
+# n^2 numbers and n^3 steps: 130 MB and some seconds for this number, 170 GB for the 25 fields of
+# the paper.  For more stars, only so many neighbors are used; 20 and 100 neighbors give the same
+# table to 1 % of its error.
 _MOST_TOGETHER, _NEIGHBORS = 4000, 50
 # Number of stars around a point from which the scatter is computed.
 _NOISE_NEIGHBORS = 50
