@@ -23,9 +23,9 @@ class Basis:
     Parameters
     ----------
     center, half : (2,) ndarray
-        Middle and half sides of the rectangle, px.
+        Center and half sides of the rectangle, px.
     orders : (2, M) ndarray of int
-        Half waves along each axis, in the order of growing wave number.
+        Numbers of half waves along each axis, in order of increasing wave number.
     bends : bool
         Whether polynomials of degree 2 and 3 are included.
     """
@@ -48,13 +48,13 @@ class Basis:
         focal : (2, N) ndarray
             Focal plane, px.
         kind : {'curl-free', 'axes'}, optional
-            Gradient of a potential, or each axis by itself.
+            Whether displacements are the gradient of a potential or independent along each axis.
 
         Returns
         -------
         ndarray
-            M or 2 M waves first, then 14 polynomials if there are bends, degree by degree along
-            each axis; the last two are a constant along each axis.
+            First M or 2 M waves; then, if there are bends, 14 polynomials, degree by degree along
+            each axis; finally a constant along each axis.
         """
         parts = self.along(focal, kind)
         out = np.zeros((1 + max(mine.max() for mine, _ in parts), 2, focal.shape[1]))
@@ -63,19 +63,19 @@ class Basis:
         return out
 
     def along(self, focal, kind="curl-free"):
-        """Displacements of unit coefficients along each axis, without those that are zero there.
+        """Return the nonzero displacements of unit coefficients along each axis.
 
         Parameters
         ----------
         focal : (2, N) ndarray
             Focal plane, px.
         kind : {'curl-free', 'axes'}, optional
-            As of `shapes`.
+            As for `shapes`.
 
         Returns
         -------
         list of (ndarray, ndarray)
-            For each axis the numbers of the coefficients ``(m,)`` and displacements ``(m, N)``.
+            For each axis, the numbers of the coefficients ``(m,)`` and displacements ``(m, N)``.
         """
         phases = [
             np.outer(
@@ -116,7 +116,7 @@ class Basis:
 
 
 def inner_products(parts):
-    """Products of shapes with each other, summed over stars and axes.
+    """Compute the products of all pairs of shapes, summed over stars and axes.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def inner_products(parts):
     Returns
     -------
     (K, K) ndarray
-        Symmetric.
+        Symmetric matrix of the sums.
     """
     n = 1 + max(mine.max() for mine, _ in parts)
     total = np.zeros((n, n))
@@ -143,7 +143,7 @@ def patch(low, high, n_waves, *, bends=False):
     low, high : (2,) array_like
         Corners, px.
     n_waves : int
-        Waves to keep, the longest ones.
+        Number of waves to keep; the longest ones are kept.
     bends : bool, optional
         Whether to include polynomials of degree 2 and 3.
 

@@ -45,8 +45,8 @@ _ROUNDS_FIELD = 2
 # Before the waves are known, the errors of the stars are overestimated.
 _ROUNDS_WAVES = 2
 
-# How much larger residuals may be in one part of the detector than elsewhere before they are
-# taken for outliers, once the instrument is known.
+# Once the instrument is known: how much larger residuals may be in one part of the detector than
+# elsewhere before they are taken for outliers.
 _MAX_LOCAL_SCALE = 10.0
 
 # Updates of the variances in each linear step.
@@ -84,40 +84,43 @@ def solve(
     image_shape : (int, int) or dict
         Shape ``(ny, nx)`` of the detectors, or of each by its name.
     crpix : (2,) array_like or dict, optional
-        Reference point, px, zero based; the center of the detector, or that of ``solution``, if not
-        given.
+        Reference point, px, zero based.  Default: that of ``solution``, or else the center of the
+        detector.
     cd : (2, 2) array_like, optional
-        Nominal matrix CD0 used by the polynomial of a single detector, deg / px; the mean of the
-        solved ones if not given.
+        Nominal matrix CD0 for the polynomial of a single detector, deg / px.  Default: the mean of
+        the solved matrices.
     weight : RadialWeight or dict, optional
-        Radial weight of the stored polynomial; by default ``exp-sqrt`` with 0.87 times half the
-        shorter side, or uniform with ``lut="none"``, where no table corrects an extrapolation.
+        Radial weight of the stored polynomial.  Default: ``exp-sqrt`` with 0.87 times half the
+        shorter side, or uniform with ``lut="none"``, because then no table corrects an
+        extrapolation.
     degree : int or 'auto', optional
         Degree of the stored polynomial, and the highest degree of the distortion of a detector.
         ``auto``: up to 7 by evidence, stored as a cubic and a table.
     n_grid : int, optional
         Nodes of the look-up table along each axis.
     lut : {'auto', 'always', 'none'}, optional
-        Whether residuals are smoothed into a table; ``auto`` decides from the data.  ``none`` gives
-        the polynomial alone.
+        Whether residuals are smoothed into a table.  ``auto`` decides from the data, and ``none``
+        returns the polynomial alone.
     refine : {'auto', 'attitude', 'field', 'pv'}, optional
-        What is fitted for each exposure: six linear numbers (``attitude``), also a smooth field if
-        there is evidence for it (``auto``) or always (``field``), or a polynomial (``pv``, as in
+        What is fitted to each exposure: six linear numbers (``attitude``), a smooth field as well
+        if there is evidence for it (``auto``) or always (``field``), or a polynomial (``pv``, as in
         the paper).
     solution : DistortionSolution or dict, optional
         Stored instrument, or one for each detector by its name.
     update : bool, optional
-        Add the residuals of these exposures to those of ``solution`` and make a new table.
+        Whether to add the residuals of these exposures to those of ``solution`` and make a new
+        table.
     pool_attitudes : bool, optional
         Estimate from five or more exposures how much scale, rotation and skew vary between them,
         and draw those of each exposure toward their mean accordingly.
     clip : float, optional
         Pairs with residuals of more than this many robust standard deviations are left out.
     table_choice : dict, optional
-        Settings of the tables by detector, as found before (``result.table_infos[name].choice``),
-        instead of choosing them again: for pairs of which only a few have changed.
+        Settings of the tables by detector, from an earlier result
+        (``result.table_infos[name].choice``).  This saves time if only a few pairs have changed.
+        Default: the settings are chosen.
     seed : int, optional
-        Seed of the division of a single exposure's stars for cross-validation.
+        Seed for the division of the stars of a single exposure into groups for cross-validation.
 
     Returns
     -------
@@ -127,7 +130,7 @@ def solve(
     Raises
     ------
     FitError
-        If the pairs cannot determine what is asked for; the message names the numbers.
+        If the pairs cannot determine the solution; the message has the numbers.
     ValueError
         If an option has a wrong value.
 
@@ -269,7 +272,7 @@ def _check_options(exposures, degree, lut, refine, solution, update):
 
 
 def _by_name(value, names):
-    """Give each detector its value: by name, or the same for all; nothing for `None`."""
+    """Return the value of each detector, given by name or for all; nothing for `None`."""
     if value is None:
         return {}
     return (
@@ -352,7 +355,7 @@ def _settled(o, state, clip, pool):
 
 
 def _updated(o, state, stored, group, n_grid, force):
-    """Let stored solutions follow what these exposures have in common, see `find_change`."""
+    """Adapt stored solutions to the common residuals of these exposures, see `find_change`."""
     for name, solution in stored.items():
         if solution.residual_map is None:
             raise FitError(

@@ -24,16 +24,16 @@ _MOST_WAVES, _STARS_PER_WAVE = 120, 2
 # Log evidence required for a change beyond that of the fields of exposures, nats.
 AGAINST_CHANGE = 3.0
 
-# What is learned about a change's spectrum beyond that (two numbers): a false alarm is then rarer
-# than one in a thousand.
+# Additional evidence required for the two numbers of the spectrum of a change.  False alarms are
+# then rarer than one in a thousand.
 _LEAST_GAIN = 3.0
 
 # Number of exposures whose fields determine the spectrum.
 _EXPOSURES_TRIED = 12
 
-# The uncertainty of a stored map is itself an estimate: maps of a few turbulent exposures are wrong
-# by up to 1.7 times as much as they state, which is no change.  They have as many parameters as a
-# polynomial of degree 7 where there is no table.
+# The uncertainty of a stored map is itself an estimate: maps from a few turbulent exposures are
+# wrong by up to 1.7 times their uncertainty, which is not a change.  Without a table, they have as
+# many parameters as a polynomial of degree 7.
 _STALE_MARGIN, _FREEDOM = 2.0, 36.0
 
 # Points along each axis for the average of a change.
@@ -51,7 +51,7 @@ class Change:
     coefficients : (2, M + 3) ndarray
         Coefficients of the waves, and of the linear part that attitudes absorb.
     half : (2, M, M + 3) ndarray
-        Halves H of the covariances, which are H^T H.
+        Square roots H of the covariances, which are H^T H.
     variance : float
         Variance added to the stored map along each axis (process noise), px^2; 0 for no change.
     gain : float
@@ -68,7 +68,7 @@ class Change:
     field: Spectrum | None
 
     def __call__(self, focal):
-        """Displacement ``(2, N)`` at focal plane positions, px.
+        """Return the displacement ``(2, N)`` at focal plane positions, px.
 
         Parameters
         ----------
@@ -78,7 +78,7 @@ class Change:
         return self.coefficients @ _columns(self.basis, focal).T
 
     def covariance(self, focal):
-        """Posterior covariance ``(2, 2, N)``, px^2.
+        """Return the posterior covariance ``(2, 2, N)``, px^2.
 
         Parameters
         ----------
@@ -114,22 +114,23 @@ def find_change(o, state, k, stored):
     k : int
         Number of the detector.
     stored : DistortionSolution
-        Its statistics tell how strong the fields of its exposures were.
+        Stored solution, whose statistics have the strength of the fields of its exposures.
 
     Returns
     -------
     change : Change
-        The change by evidence; with variance 0 if there is none, it is the likely error of the
-        stored solution.
+        The change, if there is evidence for one.  Otherwise its variance is 0, and it is the likely
+        error of the stored solution.
     common : Change
-        The common residuals whatever the evidence, without shrinkage.
+        The common residuals, regardless of evidence and without shrinkage.
 
     Notes
     -----
-    Each exposure e of normal matrix G and right-hand side h has a field of prior variances P,
-    which leaves :math:`F_e = (G_e^{-1} + P)^{-1}` for the change; these add up.  The variances of
-    fields and change are those of the largest evidence.  A single exposure cannot tell its field
-    from a change: there it matters how strong the fields of the stored exposures were.
+    Each exposure e with normal matrix G and right-hand side h has a field with prior variances P.
+    With the field marginalized, its contribution to the normal matrix of the change is
+    :math:`F_e = (G_e^{-1} + P)^{-1}`, and the contributions add up.  The variances of fields and
+    change maximize the evidence.  A single exposure cannot separate its field from a change, so the
+    strength of the fields of the stored exposures matters.
     """
     frames = [f for f in state.active if o.detector_of[f] == k and state.kept[o.slices[f]].any()]
     counts = [int(state.kept[o.slices[f]].sum()) for f in frames]
@@ -180,9 +181,9 @@ def _columns(basis, focal):
 
 
 def _stale_power(stored, basis, detector):
-    """Variances of the waves by the uncertainty of the stored table.
+    """Variances of the waves from the uncertainty of the stored table.
 
-    The same for as many waves as it has parameters.
+    They are equal for as many waves as the table has parameters.
     """
     out = np.zeros(basis.orders.shape[1])
     x, y = detector.grid(POINTS)
@@ -292,7 +293,7 @@ def _log_evidence(products, basis, field, change):
 
 
 def _posterior(products, basis, field, change):
-    """Coefficients of a change of known spectrum, and the halves of their covariances."""
+    """Coefficients of a change of known spectrum, and square roots of their covariances."""
     means, halves = [], []
     power, root = _power(field, basis), np.sqrt(change)
     for a in range(2):

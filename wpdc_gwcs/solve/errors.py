@@ -20,16 +20,16 @@ __all__ = [
 MODES = np.array([[1, 0, 0, 1], [0, -1, 1, 0], [1, 0, 0, -1], [0, 1, 1, 0]]) / np.sqrt(2)
 MODE_NAMES = ("scale", "rotation", "stretch", "shear")
 
-# Degrees of freedom that the errors of all frames count for in each of them.
+# Weight of the errors of all frames in each frame, in degrees of freedom.
 _POOLED_FREEDOM = 200.0
 
-# Degrees of freedom that the stated errors count for: a few stars do not prove them wrong.
+# Weight of the stated errors, in degrees of freedom: a few stars do not prove them wrong.
 _STATED_FREEDOM = 40.0
 
-# What the stars do not see has heavier tails than a normal distribution: growth of the errors with
-# the distance to the nearest star in units of the stars' spacing, beyond one spacing and up to so
-# many more.  More stars than this do not make gaps of smaller ones.  From benchmarks/few_stars.py:
-# three sigma are to hold 99 % of the errors where there are no stars.
+# Errors where there are no stars have heavier tails than a normal distribution.  They grow with the
+# distance to the nearest star in units of the spacing of stars, beyond one spacing and up to this
+# many more.  Above this number of stars, gaps do not shrink any further.  The values are from
+# benchmarks/few_stars.py: where there are no stars, 99 % of errors must be within three sigma.
 _GROWTH, _FARTHEST, _ENOUGH_STARS = 0.5, 3.0, 100
 
 
@@ -69,10 +69,10 @@ def clip_outliers(observations, residual, sigma, leverage, clip, *, local=np.inf
 
     Notes
     -----
-    A pair is compared with those about it on the detector and with those of its frame: where the
-    instrument is not yet known, which may be far from where most stars are, all residuals are
-    large, and clipping them would keep it unknown.  A star that the model follows has a small
-    residual whatever is wrong with it: it is judged by what the others predict.
+    A pair is compared with its neighbors on the detector and with the other pairs of its frame.
+    Where the instrument is not yet known, often far from most stars, all residuals are large, and
+    clipping them would keep it unknown.  The residual of a star with high leverage is small even if
+    the star is wrong, so a star is judged by the prediction of the other stars.
     """
     o = observations
     normalized = np.abs(residual) / (sigma * np.sqrt(np.clip(1.0 - leverage, 1e-3, None)))
@@ -114,7 +114,7 @@ def error_model(residual, sigma, *, stated, freedom):
     residual, sigma : (2, N) ndarray
         Residuals, inflated for the degrees of freedom of the fit, and their errors.
     stated : bool
-        Whether the errors were given: then there is a floor, and few stars do not overrule them.
+        Whether the errors were given.  If so, there is a floor, and few stars do not overrule them.
     freedom : float
         Degrees of freedom of the residuals.
 
@@ -170,7 +170,7 @@ def frame_scale(pull, freedom):
 
 
 def extrapolation(stars, places):
-    """Return factors on the uncertainty of a distortion by the distance to its stars.
+    """Return factors for the uncertainty of a distortion, by the distance to its stars.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def extrapolation(stars, places):
     Returns
     -------
     (N,) ndarray
-        1 among the stars, and larger far from them.
+        Factors: 1 among the stars, and larger far from them.
     """
     n = stars.shape[1]
     if not n:
@@ -200,7 +200,7 @@ def repetition(star, variance, reference):
     variance : (N,) ndarray
         Variances of the pairs, which were fitted as if all errors were independent.
     reference : (N,) ndarray
-        Share of the reference stars in them.
+        Part of the variances that is due to reference stars.
 
     Returns
     -------

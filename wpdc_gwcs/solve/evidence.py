@@ -4,14 +4,14 @@ import numpy as np
 
 __all__ = ["inflation", "learn_sequence"]
 
-# Scatter of the logarithm of a group's size about what the group before it lets one expect.  Broad:
-# one degree of a distortion may well be ten times another.
+# Scatter of the logarithm of the size of a group about its expectation from the group before.  It
+# is broad, because one degree of a distortion may well be ten times as large as another.
 _LOG_SCATTER = 1.2
 
 _NEWTON_STEPS = 30
 
-# Numbers that the coefficients of one degree are worth, of one detector: those of a radial
-# distortion are all the same one, for all degrees.
+# Number of independent values that the coefficients of one degree of a detector count as.  It is
+# small: for a radial distortion, all coefficients of all degrees follow from a single value.
 _INDEPENDENT = 0.5
 
 
@@ -36,9 +36,9 @@ def learn_sequence(square, count, sigma, decay):
 
     Notes
     -----
-    Maximizes ``sum(-n ln s - S / (2 s^2))`` with a Gaussian random walk of ``ln s`` as prior, so
-    that a degree about which the stars say nothing is taken to be somewhat smaller than the one
-    below it, and never to be zero.
+    The step maximizes ``sum(-n ln s - S / (2 s^2))`` with a Gaussian random walk of ``ln s`` as
+    prior.  A degree that the stars do not constrain is therefore assumed to be somewhat smaller
+    than the one below it, and never zero.
     """
     # Precision of a random walk of the logarithm.
     step = np.diff(np.eye(len(count)), axis=0)
@@ -59,22 +59,22 @@ def learn_sequence(square, count, sigma, decay):
 
 
 def inflation(determined):
-    """Return the factor of a sequence of standard deviations for what is not known of them.
+    """Return the factor by which standard deviations grow because they are uncertain.
 
     Parameters
     ----------
     determined : (D, G) ndarray
-        Number of coefficients of each group that the stars determine, of each detector.
+        Number of coefficients of each group that the stars determine, for each detector.
 
     Returns
     -------
     float
-        Near 1 where many detectors tell the sizes of the groups, and larger the less is known.
+        Factor: near 1 if many detectors determine the sizes of the groups, larger if less is known.
 
     Notes
     -----
-    The logarithm of a standard deviation is known to v = 1 / (2 n) from n independent numbers; for
-    a normal distribution of the logarithm, the mean of the variance is exp(2 v) times its mode.
+    With n independent values, the logarithm of a standard deviation has the variance v = 1 / (2 n).
+    If the logarithm has a normal distribution, the mean of the variance is exp(2 v) times its mode.
     """
     known = 1.0 / (1.0 / np.maximum(determined, 1e-3) + 1.0 / _INDEPENDENT)
     return float(np.exp(0.5 / np.sum(known)))

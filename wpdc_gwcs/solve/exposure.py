@@ -28,10 +28,9 @@ class Exposure:
     cd : (2, 2) array_like
         Starting linear matrix, deg / px.
     x_err, y_err : (N,) array_like, optional
-        Total 1-sigma errors (centroid and reference), px; estimated from the residuals if not
-        given.
+        Total 1-sigma errors (centroid and reference), px.  Default: estimated from the residuals.
     reference_err : (N,) array_like, optional
-        Share of the reference positions in these errors, px; 0 if not given.
+        Part of these errors that is due to the reference positions, px.  Default: 0.
     star : (N,) array_like of int, optional
         Number of the star of each pair, 0 or more, the same in all exposures.
     use : (N,) array_like of bool, optional
@@ -41,7 +40,7 @@ class Exposure:
     detector : str, optional
         Name of the detector.
     exposure : hashable, optional
-        Identifier that the frames of one exposure of a mosaic share; not shared by default.
+        Identifier that the frames of one exposure of a mosaic share.  Default: none is shared.
     """
 
     name: str
@@ -77,7 +76,7 @@ class ExposureFit:
         Residuals X'' - X_ref, Y'' - Y_ref of all pairs given, undistorted px; NaN where a position
         is NaN.
     x_err, y_err : (N,) ndarray
-        Errors of the pairs as the fit found them: those given, rescaled, with a floor.
+        Errors of the pairs according to the fit: the given ones, rescaled and with a floor.
     used : (N,) ndarray of bool
         Pairs that were fitted: allowed, valid and not clipped.
     sigma : (3, n, n) ndarray or None
@@ -130,9 +129,9 @@ class SolveResult:
     solutions : dict
         `DistortionSolution` of each detector, by name.
     exposures : tuple of ExposureFit
-        One per frame given, in that order.
+        One for each given frame, in the same order.
     rejected : dict of str
-        Names of the frames that were left out, and why.
+        Reason for each frame that was left out, by name.
     table_infos : dict
         `TableInfo` of each detector, by name; no entry without a table.
     reference_color : float or None

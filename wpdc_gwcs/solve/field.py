@@ -1,10 +1,10 @@
 """The field of an exposure: a smooth random displacement of the focal plane.
 
-The atmosphere shifts the stars of one exposure by a few hundredths of a pixel, alike over minutes
-of arc; focus, filter and flexure bend it.  This is a Gaussian process with a von Karman
-spectrum, written as a sum of sine waves on a patch a little larger than the detector, and a few
-polynomials: the waves are the shapes of a linear model, the spectrum is the prior of their
-coefficients, and so the field is one more term with a prior.
+The atmosphere shifts the stars of one exposure by a few hundredths of a pixel, with correlations
+over several arcminutes; focus, filter and flexure bend it.  This is a Gaussian process with a von
+Karman spectrum, written as a sum of sine waves on a patch slightly larger than the detector, plus a
+few polynomials.  The waves are the shapes of a linear model, and the spectrum is the prior of their
+coefficients, so the field is one more term with a prior.
 
 ::
 
@@ -34,7 +34,7 @@ class Field:
     spectrum : Spectrum
         Prior.
     coefficients : (M,) ndarray
-        Of the columns of the design.
+        Coefficients of the columns of the design.
     root : (M, M) ndarray
         Lower factor of the posterior precision in units of the prior.
     freedom : float
@@ -58,7 +58,7 @@ class Field:
         Returns
         -------
         ndarray
-            Px of the focal plane.
+            Displacement in px of the focal plane.
         """
         shapes = self.basis.shapes(focal, self.spectrum.kind)
         return (self.coefficients @ shapes.reshape(len(shapes), -1)).reshape(2, -1)
@@ -105,7 +105,7 @@ class Field:
         Returns
         -------
         (2, 2, N) ndarray
-            Px^2 of the focal plane.
+            Covariance in px^2 of the focal plane.
         """
         return self._covariance(self._scaled(focal))
 
@@ -144,7 +144,7 @@ def fit_field(basis, spectrum, focal, residual, variance):
     Returns
     -------
     Field
-        Mean and covariance.
+        Field with its mean and covariance.
     """
     weight = 1.0 / (variance + spectrum.unresolved(basis))
     root = np.sqrt(spectrum.prior(basis))

@@ -13,36 +13,36 @@ from wpdc_gwcs.solve.waves import fit_waves
 
 __all__ = ["with_fields", "with_spectra", "with_statics"]
 
-# Waves that are marginalized while the shared terms are solved, and those of the final field; stars
-# for each.
+# Number of waves that are marginalized while the shared terms are solved, and of the final field;
+# number of stars needed for each.
 _MOST_MARGINAL, _MOST_FINAL = 250, 1000
 _STARS_PER_WAVE_MARGINAL, _STARS_PER_WAVE = 3, 4
 
-# Stars of a detector, of all exposures, that tell its waves.
+# Number of stars of a detector, from all exposures, that determine its waves.
 _LEAST_WAVES = 100
 
-# Steps of the grid that waves are sampled on: twice those of a table, so that its nodes, and what
-# the rims have at the outermost ones, are among them.
+# Number of steps of the grid on which waves are sampled: twice that of a table, so that the nodes
+# of the table, with the edge effects at the outermost ones, are grid points.
 _STEPS_WAVES = 98
 
-# With more stars on each detector than this, its table finds by itself what else the exposures
-# share, in more detail than a field.
+# With more stars than this on each detector, its table describes whatever else the exposures share,
+# in more detail than a field.
 _TABLE_ALONE = 6000
 
-# Waves of what the exposures of a detector share, and stars that its spectrum is learned from.
+# Number of waves of the field that the exposures of a detector share, and stars for its spectrum.
 _MOST_STATIC, _STARS_POOLED = 300, 10_000
 
 # Frames of an exposure from which its spectrum is learned, those with the most stars.
 _FRAMES_PER_EXPOSURE = 6
 
-# Largest outer scale in units of the patch; of one exposure alone, whose polynomial is free, the
-# rest is distortion.
+# Largest outer scale in units of the patch.  For a single exposure, whose polynomial is free,
+# larger scales belong to the distortion.
 _LONGEST, _LONGEST_ALONE = 4.0, 1.0
 
-# In a mosaic stars of the neighbors within this share of a detector's longer side help.
+# In a mosaic, stars of neighbors count within this fraction of the longer side of a detector.
 _MARGIN = 0.35
 
-# First guess of a field's amplitude in units of the stars' errors, and of what exposures share.
+# First guess of the amplitude of a field, and of a shared field, in units of the errors of stars.
 _FIRST_AMPLITUDE, _FIRST_STATIC = 1.0, 0.3
 
 
@@ -68,7 +68,7 @@ def with_spectra(o, state, *, force=False, bends=True):
     state : State
         Current solution; its fields are ignored.
     force : bool, optional
-        Give every exposure a field, whatever the evidence.
+        Whether to give every exposure a field, regardless of evidence.
     bends : bool, optional
         Whether exposures may have polynomials in addition to waves.
 
@@ -138,12 +138,12 @@ def with_fields(o, state):
     o : Observations
         Pairs.
     state : State
-        With spectra.
+        State with spectra.
 
     Returns
     -------
     State
-        With fields.
+        State with fields.
     """
     fields = {}
     plain = replace(state, model=state.model.with_fields({}))
@@ -170,21 +170,21 @@ def with_fields(o, state):
 def with_statics(o, state):
     """State with the smooth structure of each detector that its exposures share.
 
-    The waves that stand out, see `fit_waves`, and where there are not enough stars for a table, a
-    field for the remaining structure.  Its spectrum is learned from all detectors, because one
-    detector alone may have too few stars.
+    These are the significant waves, see `fit_waves`, and, if there are not enough stars for a
+    table, a field for the remaining structure.  The spectrum of this field is learned from all
+    detectors, because a single detector may have too few stars.
 
     Parameters
     ----------
     o : Observations
         Pairs.
     state : State
-        Where the solution stands.
+        Current solution.
 
     Returns
     -------
     State
-        Detectors of too few stars have no waves, those of many no field.
+        New state.  Detectors with too few stars have no waves; those with many have no field.
     """
     plain = replace(state, model=state.model.changed(statics={}))
     stars, statics = {}, {}
@@ -206,7 +206,7 @@ def with_statics(o, state):
 
 
 def _common_fields(o, state, stars):
-    """Fields of one spectrum for all detectors of a mosaic, if their stars speak for it."""
+    """Fields with one spectrum for all detectors of a mosaic, if there is evidence for them."""
     typical = float(np.median([columns[0].shape[1] for columns in stars.values()]))
     if len(o.detectors) == 1 or typical > _TABLE_ALONE:
         return {}
@@ -234,7 +234,7 @@ def _common_fields(o, state, stars):
 
 
 def _affine(focal):
-    """Columns of a shift and a linear map, which a detector's place takes."""
+    """Columns of a shift and a linear map, which belong to the place of a detector."""
     middle = focal - focal.mean(1, keepdims=True)
     rows = np.stack([np.ones(focal.shape[1]), *(middle / np.abs(middle).max())], axis=1)
     zero = np.zeros_like(rows)
@@ -250,7 +250,7 @@ def _stars(o, state, f):
 
 
 def _places(o, state, f):
-    """Places of the kept pairs of a frame on the focal plane, without distortion."""
+    """Focal plane positions of the kept pairs of a frame, without distortion."""
     s, k = o.slices[f], int(o.detector_of[f])
     kept = state.kept[s]
     return block(state.model, k, o.detectors[k], o.x[s][kept], o.y[s][kept])[1]

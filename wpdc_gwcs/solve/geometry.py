@@ -17,7 +17,7 @@ __all__ = ["Geometry", "mean_direction", "start_geometry"]
 # Points along each axis that represent the linear WCS of a frame.
 _POINTS = 4
 
-# Step on the tangent plane to measure its rotation, deg.
+# Step on the tangent plane for measuring its rotation, deg.
 _STEP = 1e-3
 
 
@@ -25,13 +25,13 @@ _STEP = 1e-3
 class Geometry:
     """The linear part of a camera and its exposures.
 
-    The focal plane is in px along the axes of its first detector, so that one detector alone is
-    its own focal plane.
+    The focal plane is in px along the axes of its first detector, so a single detector is its own
+    focal plane.
 
     Parameters
     ----------
     place : (D, 2) ndarray
-        Focal plane position of each detector's reference point, px.
+        Focal plane position of the reference point of each detector, px.
     matrix : (D, 2, 2) ndarray
         Focal plane px per detector px.
     pointing : (E, 2) ndarray
@@ -39,7 +39,7 @@ class Geometry:
     cd : (E, 2, 2) ndarray
         Tangent plane deg per focal plane px.
     radius : float
-        Reach of the focal plane about its origin, px.
+        Radius of the focal plane about its origin, px.
     """
 
     place: np.ndarray
@@ -49,7 +49,7 @@ class Geometry:
     radius: float
 
     def focal(self, k, detector, x, y):
-        """Focal plane position of pixels of detector number ``k``, without any distortion.
+        """Return the focal plane position of pixels of a detector, without any distortion.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class Geometry:
         return self.place[k][:, None] + self.matrix[k] @ offset
 
     def reference(self, exposure, ra, dec):
-        """Focal plane position of sky positions in one exposure, ``(2, N)``, px.
+        """Return the focal plane position of sky positions in one exposure, ``(2, N)``, px.
 
         Parameters
         ----------
@@ -81,7 +81,7 @@ class Geometry:
         return np.linalg.solve(self.cd[exposure], plane)
 
     def sky(self, exposure, focal):
-        """Sky position of the focal plane in one exposure, deg.
+        """Return the sky position of focal plane positions in one exposure, deg.
 
         Parameters
         ----------
@@ -93,7 +93,7 @@ class Geometry:
         return deproject(*(self.cd[exposure] @ focal), self.pointing[exposure])
 
     def moved(self, exposure, shift, matrix):
-        """Pointing and CD of an exposure once ``shift + matrix @ focal`` replaces ``focal``.
+        """Return pointing and CD of an exposure if ``shift + matrix @ focal`` replaces ``focal``.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class Geometry:
         """
         cd = self.cd[exposure]
         at = cd @ shift
-        # North rotates with the pointing, near a pole by any angle.
+        # The direction of north depends on the pointing, near a pole by any angle.
         step = at[:, None] + _STEP * np.array([[0.0, 1.0, -1.0, 0.0, 0.0],
                                                [0.0, 0.0, 0.0, 1.0, -1.0]])  # fmt: skip
         sky = np.array(deproject(*step, self.pointing[exposure]))
@@ -187,7 +187,7 @@ def _start_mosaic(o, n_detectors, n_exposures):
 
 
 def _points(frame, detector):
-    """Pixels about the reference point, and their sky by the frame's own linear WCS."""
+    """Pixels about the reference point, and their sky positions by the linear WCS of the frame."""
     x, y = detector.grid(_POINTS)
     x, y = np.append(detector.center[0], x), np.append(detector.center[1], y)
     offset = np.array([x, y]) - detector.crpix[:, None]
@@ -195,7 +195,7 @@ def _points(frame, detector):
 
 
 def mean_direction(sky):
-    """Mean of directions as vectors: right ascensions do not average across 0 h.
+    """Compute the mean of directions as vectors, which is correct across 0 h and at the poles.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def _fit_pointing(o, frames, points, place, matrix, start):
 
 
 def _turned(focal, sky, start):
-    """Fit the starting CD of an exposure of any roll, on the plane about its own middle."""
+    """Fit the starting CD of an exposure of any roll, on the plane about its center."""
     plane = np.array(project(*sky, mean_direction(sky.T)))
     a = focal - focal.mean(1, keepdims=True)
     b = plane - plane.mean(1, keepdims=True)

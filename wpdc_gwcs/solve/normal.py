@@ -1,4 +1,4 @@
-"""Normal equations: accumulated by frame, solved by elimination of local unknowns.
+"""Normal equations: accumulated frame by frame, solved by elimination of local unknowns.
 
 ::
 
@@ -6,9 +6,9 @@
     products of all frames --"+"--> Blocks of camera, detectors and exposures
     Blocks, priors --posterior--> means, and covariances of any detector in any exposure
 
-Detectors meet only through the camera and the exposures, exposures only through the camera and the
-detectors: whichever of the two is larger is eliminated (Schur complement), so that cost and memory
-grow linearly with it.
+Detectors are coupled only through the camera and the exposures, and exposures only through the
+camera and the detectors.  The larger of the two groups is eliminated (Schur complement), so cost
+and memory grow linearly with it.
 """
 
 from dataclasses import dataclass
@@ -74,7 +74,7 @@ def frame_equations(design, residual, weight, *, field=None):
     """
     _, p, n = design.mix.shape
     root = np.sqrt(weight)
-    # The residual is one more column, and a shape of its own.
+    # The residual is treated as one more column, with its own shape.
     mix = np.zeros((2, p + 1, n + 1))
     mix[:, :p, :n], mix[:, p, n] = design.mix, 1.0
     rows = [np.vstack([design.shapes, residual[a]]) * root[a] for a in range(2)]
@@ -192,7 +192,7 @@ class Posterior:
         Parameters
         ----------
         detector, exposure : int
-            Their numbers.
+            Numbers of the detector and the exposure.
 
         Returns
         -------

@@ -13,19 +13,20 @@ __all__ = ["without_aliens", "without_wrong"]
 
 log = logging.getLogger(__name__)
 
-# Larger scatter than any model leaves for correct pairs, px.
+# Scatter that no model leaves for correct pairs, px.
 _MAX_SCATTER = 2.0
 
 # An exposure with this many times the scatter of the others has wrong pairs.
 _REJECT_RATIO = 4.0
 
-# Before a solution, distortion increases the residuals, but not beyond this ratio to the others and
-# not beyond this many px; frames with fewer pairs than the terms of a linear map are not judged.
+# Before a solution, distortion increases the residuals, but not beyond this ratio to those of other
+# frames, and not beyond this many px.  Frames with fewer pairs than a linear map needs are not
+# tested.
 _ALIEN_RATIO, _ALIEN_SCATTER, _LINEAR_TERMS = 10.0, 50.0, 6
 
 
 def without_aliens(o, state):
-    """Leave out frames whose pairs no linear map brings near those of the others.
+    """Leave out frames whose pairs no linear map brings into agreement with those of other frames.
 
     Such a frame would spoil the polynomial for all.
 

@@ -21,7 +21,7 @@ N_SIGMA = 17
 # Nodes of the table of a field per shortest wave.
 _NODES_PER_WAVE = 5
 
-# Deviations of a frame from polynomial, table and attitude that need no table of its own, px.
+# If a frame deviates by less than this from polynomial, table and attitude, it needs no table, px.
 _LEAST_FIELD = 1e-4
 
 
@@ -130,7 +130,7 @@ def _growth(o, state, k, x, y):
 
 
 def inherited(o, state, k):
-    """Return the factor on the errors of the distortion for stars that exposures share.
+    """Return the factor for the errors of the distortion due to stars that exposures share.
 
     Parameters
     ----------
@@ -238,7 +238,7 @@ def delivered_residual(o, f, solution, parts):
     f : int
         Number of the frame.
     solution : DistortionSolution
-        Of its detector.
+        Solution of its detector.
     parts : dict
         Result of the frame.
     """

@@ -130,8 +130,8 @@ def _statistics(o, state, k, info, solution, settings):
     statistics = {"n_exposures": len(frames), "n_used": kept}
     for name, value in statistics.items():
         statistics[name] = value + solution.statistics.get(name, 0)
-    # One model for pairs with stated errors, one for pairs without (there the scale is the error
-    # in px); the first of them by itself, too.
+    # One model for pairs with stated errors, and one for pairs without, whose scale is the error in
+    # px; the first one is also given by itself.
     first = next(iter(state.error_models.values()))
     statistics |= {
         "error_scale": first["scale"], "error_floor": first["floor"],

@@ -174,7 +174,7 @@ def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
     focal, residual, weight : (2, N) ndarray
         Positions, residuals (px) and inverse variances of the stars.
     nuisance : (2, N, K) ndarray, optional
-        Columns fitted freely beside the field: the attitude of a single detector.
+        Columns that are fitted freely with the field: the attitude of a single detector.
     kinds : tuple of str, optional
         Kinds of field.
 
@@ -193,7 +193,7 @@ def products(basis, focal, residual, weight, *, nuisance=None, kinds=KINDS):
     blocks = {}
     for kind in kinds:
         parts = basis.along(focal, kind)
-        # Where nothing moves stars along both axes, each axis stands by itself.
+        # If nothing shifts stars along both axes, the axes are independent.
         groups = [(0,), (1,)] if kind == "axes" and not together else [(0, 1)]
         blocks[kind] = []
         for axes in groups:
@@ -228,7 +228,7 @@ def learn_spectra(frames, make, *, start, scales, force=False):
     scales : (float, float)
         Smallest and largest outer scale, px.
     force : bool, optional
-        Return a spectrum for every exposure, whatever the evidence.
+        Whether to return a spectrum for every exposure, regardless of evidence.
 
     Returns
     -------
@@ -237,9 +237,9 @@ def learn_spectra(frames, make, *, start, scales, force=False):
 
     Notes
     -----
-    Maximum a posteriori: the logarithms of amplitude and scale of an exposure scatter by 1 and 0.7
-    about the pooled ones.  A field that all exposures have in common, by evidence, belongs to
-    the detector.
+    This is the maximum a posteriori: the logarithms of amplitude and scale of an exposure scatter
+    by 1 and 0.7 about the pooled ones.  If there is evidence that all exposures share a field, it
+    belongs to the detector.
     """
     if not frames:
         return {}
@@ -264,7 +264,7 @@ def learn_spectra(frames, make, *, start, scales, force=False):
 
 
 def _is_common(patches, spectrum):
-    """Return whether all exposures of a detector have the same field, so that it is static."""
+    """Return whether all exposures of a detector have the same field, which is then static."""
     each = common = 0.0
     for basis in {id(p.basis): p.basis for p in patches}.values():
         mine = [p for p in patches if p.basis is basis]
@@ -360,7 +360,7 @@ def _gain(found):
 
 
 def _penalty(p, scales, about):
-    """Minus the log prior of amplitude and scale: within limits, and about those of all."""
+    """Minus the log prior of amplitude and scale: within limits, and about the pooled ones."""
     low, high = np.log(scales)
     total = max(low - p[1], p[1] - high, 0.0) ** 2
     if about is not None:

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 # Minimum number of exposures to estimate the scatter of attitudes.
 _MIN_EXPOSURES_POOL = 5
 
-# Linear maps that differ by more than this are intentional (another roll of the camera).
+# Linear maps that differ by more than this do so on purpose (another roll of the camera).
 _MAX_POOLED = 0.05
 
 # With more stars than this in a frame, leverages are negligible.
@@ -291,7 +291,7 @@ def _applied(model, scopes, values, found, sigma):
 
 
 def _pooled(o, state, own):
-    """Learn how much scale, rotation and skew of the exposures vary."""
+    """Learn how much scale, rotation and skew vary between exposures."""
     if o.n_exposures < _MIN_EXPOSURES_POOL:
         return state
     cd = state.model.geometry.cd
@@ -309,7 +309,7 @@ def _pooled(o, state, own):
     for e in active:
         data = state.own[e] - (precision[e] - before[e])
         covariance = np.linalg.inv(data)[:6, :6]
-        # The estimate with the prior is a compromise that the data pull with their precision.
+        # The estimate with the prior is a mean, weighted by precision, of the prior and the data.
         now = (b[e].reshape(4) * radius)[[0, 1, 2, 3]]
         shift = np.linalg.solve(data, -pull[e])[[1, 2, 4, 5]]
         estimates.append(((now + shift) / radius).reshape(2, 2))
@@ -434,7 +434,7 @@ def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrume
     growth : (N,) ndarray, optional
         Factors of the standard deviations of the shared terms, see `extrapolation`.
     instrument_only : bool, optional
-        Leave out the exposure's own numbers and field.
+        Whether to leave out the numbers and the field of the exposure.
 
     Returns
     -------
@@ -443,9 +443,9 @@ def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrume
 
     Notes
     -----
-    With w the shared terms, a the exposure's numbers and c the field, whose means follow w and a
-    through the stars: cov = v C_w v^T + cov(a | w) + cov(c | w, a), v the row of the shared terms
-    minus the response of a and c.
+    With w the shared terms, a the numbers of the exposure and c the field, whose means depend on w
+    and a through the stars: cov = v C_w v^T + cov(a | w) + cov(c | w, a), where v is the row of the
+    shared terms minus the response of a and c.
     """
     model, found = state.model, state.posterior
     k, e = int(o.detector_of[frame]), int(o.exposure_of[frame])

@@ -4,16 +4,16 @@ import numpy as np
 
 __all__ = ["FieldPrior", "log_strength", "summarize_fields"]
 
-# Scatter of the logarithm of the fields' strength where nothing is known of it, and the number of
-# exposures that this guess is worth; least strength in units of the stars' errors.
+# Assumed scatter of the logarithm of the strength of fields, and the number of exposures that this
+# guess is worth; least strength in units of the errors of stars.
 _LOG_STRENGTH, _GUESS_WEIGHT = 1.0, 0.5
 _LEAST_STRENGTH = 0.1
 
-# Amplitude of turbulence that bends a detector as polynomials of unit coefficients do, which it may
-# have been split into.
+# Amplitude of turbulence that bends a detector as much as polynomials with unit coefficients, in
+# which a part of it may have been absorbed.
 _AMPLITUDE_OF_BEND = 1.7
 
-# Scatter of the logarithms of an outer scale, and of a strength that no solution tells.
+# Scatter of the logarithms of an outer scale, and of a strength that no solution determines.
 _LOG_SCALE, _LOG_UNKNOWN = 0.7, 1.5
 
 

@@ -66,13 +66,13 @@ class Term:
         Factor by which a group is expected to be smaller than the one before, for a sequence
         of groups (degrees); 0 for independent groups.
     shapes : callable
-        ``shapes(block) -> (p, N)``, functions of the place that displacements along both axes are
-        made of.
+        ``shapes(block) -> (p, N)``: functions of position, of which displacements along both axes
+        are composed.
     mix : (2 p, K) ndarray or None
-        What each coefficient gives of each shape, along the first axis and then along the second;
-        `None` for a coefficient of each.
+        Weight of each shape in the displacement of each coefficient, along the first axis and then
+        along the second; `None` for one coefficient per shape.
     chromatic : bool, optional
-        Whether it vanishes at the reference color.
+        Whether the displacement vanishes at the reference color.
     """
 
     name: str
@@ -129,16 +129,16 @@ class Term:
 class Design:
     """Displacements of unit coefficients, in factors.
 
-    Coefficient k moves star n by ``mix[a, p, k] shapes[p, n]``, summed over p, along axis a.  There
-    are half as many shapes as coefficients, or fewer: products of shapes take a quarter of the time
-    of products of columns, most of which are zero along one axis.
+    Coefficient k shifts star n by ``mix[a, p, k] shapes[p, n]``, summed over p, along axis a.
+    There are at most half as many shapes as coefficients, so products of shapes take a quarter of
+    the time of products of columns, most of which are zero along one axis.
 
     Parameters
     ----------
     shapes : (p, N) ndarray
         Functions of the place.
     mix : (2, p, K) ndarray
-        What each coefficient gives of each shape, along both axes.
+        Weight of each shape in the displacement of each coefficient, along both axes.
     """
 
     shapes: np.ndarray
@@ -151,12 +151,12 @@ class Design:
         Parameters
         ----------
         parts : sequence of Design
-            Of the same stars.
+            Designs for the same stars.
 
         Returns
         -------
         Design
-            Of all coefficients.
+            Design of all coefficients.
         """
         mix = np.zeros((2, *np.sum([part.mix.shape[1:] for part in parts], axis=0)))
         p = k = 0
@@ -175,8 +175,9 @@ class Design:
 # Expected ratio of one degree of a polynomial to the degree before.
 _DECAY = 1.8
 
-# Broad starts, px: what is learned replaces them.  Distortion of degree 2 of one detector alone,
-# and of a detector in a mosaic, whose optics take the most; optics; shift and turn of a detector.
+# Broad start values, px, which are replaced by learned ones: distortion of degree 2 of a single
+# detector, and of a detector in a mosaic, where the optics have most of it; optics; shift and
+# rotation of a detector.
 _START, _START_MOSAIC, _START_OPTICS, _START_PLACE = 100.0, 3.0, 300.0, 10.0
 
 # The same for terms in color, px per magnitude.
@@ -202,14 +203,14 @@ def legendre_products(a, b, first, last, aspect=(1.0, 1.0)):
     Returns
     -------
     (p, N) ndarray
-        Degree by degree, powers of ``b`` growing.
+        Products, degree by degree, with increasing powers of ``b``.
 
     Notes
     -----
-    One variance is to serve all shapes of a degree.  Those of one degree have the same mean square
-    over the detector, as in a field that is the same everywhere: with equal coefficients, mixed
-    terms would be smaller than they are in lenses, and the middle calmer than the edge.  Along a
-    short side a polynomial of the same curvature is smaller: shapes are scaled by the sides.
+    All shapes of a degree share one variance, so they are scaled to the same mean square over the
+    detector, as in a homogeneous field.  With equal coefficients instead, mixed terms would be
+    smaller than they are in lenses, and the center would vary less than the edge.  Along a short
+    side, a polynomial of the same curvature is smaller, so shapes are scaled with the sides.
     """
     p, q = (_normalized(c, last, side) for c, side in zip((a, b), aspect))
     degrees = _degrees(first, last)
@@ -238,8 +239,8 @@ def polynomial(degree, *, mosaic=False):
     Parameters
     ----------
     degree : int
-        Largest total degree; the constant and the linear terms are those of its place, or of the
-        attitudes.
+        Largest total degree.  The constant and the linear terms belong to the place of the detector
+        or to the attitudes.
     mosaic : bool, optional
         Whether the detector is one of several.
 
@@ -250,7 +251,7 @@ def polynomial(degree, *, mosaic=False):
     """
     degrees = np.tile(_degrees(2, degree), 2)
     start = (_START_MOSAIC if mosaic else _START) / _DECAY ** (np.arange(2, degree + 1) - 2.0)
-    # Of the second degree, a detector of a mosaic has its keystone apart, see `tilt`.
+    # For a detector of a mosaic, the keystone of the second degree is a separate term, see `tilt`.
     mix = None
     if mosaic:
         mix = np.eye(len(degrees))
@@ -274,9 +275,9 @@ def polynomial(degree, *, mosaic=False):
 def _keystone():
     """Orthogonal combinations of the six columns of degree 2: two keystones, and the other four.
 
-    A keystone of one direction is (p^2, p q), of the other (p q, q^2); less constants, which a
-    shift takes, p^2 is two thirds of the Legendre polynomial.  The other factors are those of
-    `legendre_products`.
+    The keystones of the two directions are (p^2, p q) and (p q, q^2).  Except for a constant, which
+    belongs to a shift, p^2 is two thirds of the Legendre polynomial.  The other factors are those
+    of `legendre_products`.
     """
     columns = np.zeros((6, 6))
     square, mixed = 2 / 3, np.sqrt(5) / 3
@@ -316,7 +317,7 @@ def place():
 
 
 def tilt():
-    """Tilt of a detector against the focal plane of a mosaic, which it sees as a keystone.
+    """Tilt of a detector with respect to the focal plane of a mosaic, which appears as a keystone.
 
     Returns
     -------
@@ -340,7 +341,7 @@ def optics(degree):
     Parameters
     ----------
     degree : int
-        Largest total degree; constant and linear terms are the attitudes'.
+        Largest total degree.  Constant and linear terms belong to the attitudes.
 
     Returns
     -------
@@ -397,7 +398,7 @@ def refraction():
 
 
 def lateral_color():
-    """Scale of the camera in proportion to color: lateral chromatism.
+    """Scale of the camera in proportion to color: lateral color.
 
     Returns
     -------

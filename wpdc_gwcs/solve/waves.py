@@ -1,8 +1,8 @@
-"""The structure of a detector: few shapes out of many, found by sparse Bayesian learning.
+"""The structure of a detector: a few shapes out of many, found by sparse Bayesian learning.
 
 The residual structure of a detector is neither noise nor a smooth random field: it consists of some
 waves and high-degree polynomials, and most others are absent.  Each shape has its own variance,
-learned from the stars; shapes without evidence shrink to zero, so that the many candidates add no
+learned from the stars.  Shapes without evidence shrink to zero, so the many candidates add no
 noise.
 
 ::
@@ -19,8 +19,8 @@ from scipy.linalg import lapack
 
 __all__ = ["Waves", "candidates", "fit_waves"]
 
-# The period of the waves is so many times the detector: finer steps of the wave number than
-# its own size, because a wave of the sensor does not end at its edge.
+# Size of the patch of the waves, in units of the detector.  It makes the steps of the wave number
+# finer, because a wave of the sensor does not end at its edge.
 _OVERSIZE = 1.6
 
 # Shortest wave in units of the longer side.
@@ -31,8 +31,8 @@ _SHORTEST = 0.1
 _DEGREE = 9
 _FREE_DEGREE, _STARS_PER_TERM = 5, 40
 
-# Detectors roll off within some pixels of their rims.  A table takes of it what its outermost nodes
-# can: these are shapes, too, of a table of so many nodes.
+# Detectors have edge effects within some pixels.  A table represents them as far as its outermost
+# nodes can, so these are shapes as well, for a table with this many nodes.
 _NODES, _RIMS = 50, 4
 _OUTERMOST = CubicSpline(np.arange(_NODES), np.eye(_NODES)[0])
 
@@ -44,8 +44,8 @@ _FLOOR, _GUESS_WEIGHT = 0.02, 1.0
 # Number of updates of the variances; the last ones change them by a few percent.
 _STEPS = 8
 
-# Times that the step of the wave numbers is halved about those waves of which the stars determine
-# so many coefficients: a wave between two candidates would need many of them.
+# How often the step of the wave numbers is halved, around waves of which the stars determine this
+# many coefficients: otherwise, a wave between two candidates would need many of them.
 _ZOOMS, _SEEN = 2, 0.5
 
 # Maximum number of waves refined by a finer step: those with the largest power.
@@ -77,7 +77,7 @@ class Waves:
     taken : (F, K) ndarray
         Response of the lower polynomials to each shape, at the stars.
     half : (K, K) ndarray
-        Half H of the covariance H^T H of the coefficients of an axis.
+        Square root H of the covariance H^T H of the coefficients of an axis.
     """
 
     center: np.ndarray
@@ -105,7 +105,7 @@ class Waves:
         return self.coefficients @ self._shapes(focal)
 
     def covariance(self, focal):
-        """Return the posterior covariance, the same along both axes, with the response of others.
+        """Return the posterior covariance, including the response of other terms.
 
         Parameters
         ----------
@@ -212,10 +212,10 @@ def fit_waves(low, high, focal, residual, variance):
 
     Notes
     -----
-    The four coefficients of a wave, or the two of any other shape, have the variance p; evidence is
-    largest at p = m^2 / g, with the sum m^2 of the squares of their posterior means, and g, the
-    number of them that the stars determine (MacKay's step).  Both axes have the mean of their
-    weights.
+    The four coefficients of a wave, or the two of any other shape, have the variance p.  The
+    evidence is largest for p = m^2 / g, where m^2 is the sum of the squares of their posterior
+    means, and g is the number of them that the stars determine (MacKay's step).  Both axes use the
+    mean of their weights.
 
     References
     ----------
@@ -246,9 +246,9 @@ def fit_waves(low, high, focal, residual, variance):
 def _learned(normal, right, told, n):
     """Prior standard deviation of each coefficient, and how many of each wave are determined."""
     own = np.arange(n, len(normal) - n)
-    # A detector with an edge effect has it at all edges.
+    # A detector with an edge effect has it at all its edges.
     group = np.concatenate([np.arange(n), np.arange(n), np.minimum(own, own[-_RIMS])])
-    # What its own stars tell, those at a rim are few; waves have half of all stars each.
+    # Information of the stars of each shape: few at an edge, half of all stars for a wave.
     least = _FLOOR * np.bincount(group) / np.bincount(group, 2.0 * told)
     power = 10.0 * least
     for _ in range(_STEPS):
