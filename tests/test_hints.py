@@ -83,6 +83,17 @@ def test_of_real_errors(folder, capsys, frame, catalog, hint):
     assert ("; try" in line) == bool(hint)
 
 
+def test_of_names_in_other_letters(tmp_path, capsys):
+    for name in ("a_Z-1.wcs.asdf", "a_G-1.wcs.asdf", "CSSTMSC.camera.asdf"):
+        (tmp_path / name).touch()
+    for typed, meant in (
+        ("a_g-1.wcs.asdf", "a_G-1.wcs.asdf"),
+        ("csst-msc.camera.asdf", "CSSTMSC.camera.asdf"),
+    ):
+        assert run(["show", str(tmp_path / typed)]) == 2
+        assert error_of(capsys).endswith(f"; try: {tmp_path / meant}, which is there")
+
+
 def test_of_folders_that_are_no_results(folder, capsys):
     for command in ("evaluate", "report"):
         assert run([command, str(folder / "night")]) == 2

@@ -222,5 +222,7 @@ def _similar(path):
         while not folder.is_dir() and folder != folder.parent:
             missing, folder = folder, folder.parent
         return f"another folder: there is no {missing}"
-    close = difflib.get_close_matches(path.name, os.listdir(folder), n=1, cutoff=0.75)
-    return f"{shlex.quote(str(folder / close[0]))}, which is there" if close else None
+    # The same name in other letters comes first.
+    names = {name.casefold(): name for name in sorted(os.listdir(folder))}
+    close = difflib.get_close_matches(path.name.casefold(), names, n=1, cutoff=0.75)
+    return f"{shlex.quote(str(folder / names[close[0]]))}, which is there" if close else None
