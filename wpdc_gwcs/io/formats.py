@@ -193,7 +193,7 @@ def write(obj, path, *, format=None, degree=None, overwrite=False):
         made = write_form(obj, path, form=format, degree=degree, overwrite=overwrite)
         return made.deviation
     if degree is not None:
-        raise ValueError(f"degree has no meaning for {format!r}, got {degree}")
+        raise ValueError(f"degree must be None for {format!r}, got {degree}")
     # asdf and gwcs take half a second to import: only when needed.
     from wpdc_gwcs.io import asdf
 
