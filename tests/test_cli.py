@@ -323,6 +323,18 @@ def test_export(results, tmp_path, capsys, form):
     assert capsys.readouterr().out == ""
 
 
+def test_our_own_source_lists_tell_where_pixels_begin(simulation, inputs, tmp_path, capsys):
+    files = write_simulation(simulation, tmp_path / "sky", images=(0,), sources="ecsv")
+    image, table = map(str, files["frames"][:2])
+    found = str(tmp_path / "found.ecsv")
+    assert run(["detect", image, "--output", found, "-q"]) == 0
+    for k, (sources, header) in enumerate(((found, image), (table, files["headers"][1]))):
+        out = str(tmp_path / f"out{k}")
+        arguments = ["--wcs", str(header), "--catalog", inputs[1], "--output", out]
+        assert run(["calibrate", sources, *arguments]) == 0
+        assert "count from 0" not in capsys.readouterr().err
+
+
 def test_export_of_several_files_into_a_folder(results, tmp_path, capsys):
     folder = tmp_path / "made" / "heads"
     assert run(["export", str(results), "--format", "head", "--output", str(folder)]) == 0

@@ -62,9 +62,9 @@ def measure_sources(frame, settings=None):
     -------
     `~astropy.table.Table`
         Columns ``x``, ``y`` (px, zero based) and what else was measured.  Of an image, the meta
-        data hold ``fwhm`` (px), ``ellipticity``, ``saturation``, ``noise`` (counts) and, where a
-        PSF was fitted, ``gain`` (electrons per count), ``gain_from`` (``given``, ``header`` or
-        ``noise``) and ``mismatch`` (of the PSF, relative).
+        data have ``fwhm`` (px), ``ellipticity``, ``saturation``, ``noise`` (counts), ``pixels``
+        (zero based) and, if a PSF was fitted, ``gain`` (electrons per count), ``gain_from``
+        (``given``, ``header`` or ``noise``) and ``mismatch`` (of the PSF, relative).
 
     Raises
     ------
@@ -135,6 +135,8 @@ def measure_sources(frame, settings=None):
                 mismatch=noise.mismatch,
             )
     sources.meta["noise"] = background.noise
+    # Said in the file, which may be read as a list.
+    sources.meta["pixels"] = "zero based"
     if settings.min_snr == 0:
         return sources
     snr = np.asarray(sources["snr"], float)

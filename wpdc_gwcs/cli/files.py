@@ -142,8 +142,9 @@ def _numbers(points, names):
     try:
         return [np.float64(p) for p in points]
     except ValueError as err:
+        unit = "deg" if names[0] == "ra" else "px"
         raise InputError(
-            f"{names[0]} and {names[1]} must be numbers, got {' '.join(points)}"
+            f"{names[0]} and {names[1]} must be numbers, got {' '.join(points)} (in {unit})"
         ) from err
 
 

@@ -167,6 +167,7 @@ def write_simulation(
                 fits.writeto(temporary, image, exposure.header)
             stars.remove_column("source_index")
         elif sources == "ecsv":
+            listed.meta["pixels"] = "zero based"
             write_table(listed, frames[k], overwrite=overwrite)
             with atomic_path(headers[k], overwrite=overwrite) as temporary:
                 exposure.header.totextfile(temporary)
