@@ -146,8 +146,8 @@ def tell_match(found):
     return [
         f"{counted(found.n_pairs, 'pair')}, {found.expected_by_chance:.1f} expected by chance "
         f"({found.significance:.0f} sigma), purity {found.purity:.3f}",
-        f"the header is off by {found.shift[0]:.1f}, {found.shift[1]:.1f} px, turned by "
-        f"{found.rotation:.3f} deg, scaled by {found.scale:.5f}"
+        f"the header is off by {found.shift[0]:z.1f}, {found.shift[1]:z.1f} px, turned by "
+        f"{found.rotation:z.3f} deg, scaled by {found.scale:.5f}"
         + (", mirrored" if found.parity < 0 else ""),
         f"{counted(found.n_ambiguous, 'source')} with two candidates left out, pairs scatter by "
         f"{found.scatter:.2f} px about a smooth mapping",

@@ -212,7 +212,7 @@ def lines_about(stars):
     for name in ("pmra", "parallax", "radial_velocity", "bp_rp", "ruwe"):
         if name in present:
             known = np.isfinite(numbers_or_nan(stars, name)).mean()
-            yield "known", f"{name} of {100 * known:.1f} %"
+            yield "known", f"{name} for {100 * known:.1f} % of the stars"
     if "ruwe" in present:
         yield "RUWE", f"{int(np.sum(numbers_or_nan(stars, 'ruwe') > 1.4))} above 1.4"
 
