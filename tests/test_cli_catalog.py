@@ -108,7 +108,7 @@ def test_info_tells_what_is_there(two, capsys):
     assert f"RA {ra.min() % 360:.4f} to {ra.max():.4f}" in text
     assert "epoch       2016\n" in text
     assert "lacks       parallax: no annual parallax" in text
-    assert "ruwe of 95.8 %" in text
+    assert "ruwe for 95.8 % of the stars" in text
     first = np.sum(np.floor(table["phot_g_mean_mag"][:1200]) == 12)
     assert f" 12-13  {first:9d}" in text
 
