@@ -18,7 +18,7 @@ _REACH = 0.07
 # Copies beyond the errors are believed in where there are so many that chance and double stars
 # cannot be it: 1 to 2 of 100 stars are double within an arcsecond, few with two of one brightness.
 _LEAST_COPIES, _LEAST_SHARE, _LEAST_SHARE_ALIKE = 10, 0.05, 0.02
-# Copies are no further apart than so many times the median of their distances.
+# Greatest distance of two copies, in units of the median distance.
 _SPREAD = 4.0
 # Differences of brightness, magnitudes: of one star in two bands, and of one star measured again.
 _MOST_APART, _ALIKE = 1.0, 0.1

@@ -184,7 +184,7 @@ def _few_detections(frame, match):
             "are left out (flagged, not round or faint); the catalog has "
             f"{counted(match.n_reference, 'star')} on the frame"
         ]
-    # A shallow catalog has the bright stars: of the faint ones nobody knows.
+    # A shallow catalog has only the bright stars, and says nothing about the faint ones.
     clean = np.flatnonzero(frame.usable)
     if "flux" not in sources.colnames or len(clean) <= match.n_reference:
         return []

@@ -1,4 +1,4 @@
-"""A Dask cluster as an executor that does not wait for ever.
+"""A Dask cluster as an executor that does not wait forever.
 
 ::
 
@@ -6,8 +6,8 @@
                      |                      |
                      +--- future <--- watch: is there a scheduler, is there a worker?
 
-Dask waits for workers without a limit, and takes a scheduler that is gone for tasks that were given
-up.  Here both end the run with an error that says so; what was written until then is kept.
+Dask waits for workers without a limit, and reports the loss of its scheduler as canceled tasks.
+Here, both end the run with an error that says so.  Results that have been written are kept.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 # How often workers are counted, s.
 _PERIOD = 0.5
-# For so long, s, a client has no answer where its machine is busy: nothing to speak of.
+# A client may have no answer for this long, s, just because its machine is busy.
 _BUSY = 10.0
 _GO_ON = "what is done is kept: go on with --resume (resume=True)"
 
@@ -58,7 +58,7 @@ def cluster_executor(address, timeout):
         raise ClusterError(
             "--scheduler needs Dask, which is not installed: pip install 'wpdc_gwcs[dask]'"
         ) from err
-    # What Dask has to say of lost connections goes to its own log; the outcome is told here.
+    # Messages of Dask about lost connections are suppressed; the outcome is reported here.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     began = time.monotonic()
     try:
@@ -86,7 +86,7 @@ def cluster_executor(address, timeout):
 
 
 class _WatchedExecutor(Executor):
-    """The executor of a client, whose futures fail when there is nobody to do the work."""
+    """Executor of a client whose futures fail when there are no workers."""
 
     def __init__(self, client, address, timeout):
         self._client, self._address, self._timeout = client, address, timeout
@@ -99,7 +99,7 @@ class _WatchedExecutor(Executor):
 
     @property
     def n_workers(self):
-        """How many tasks are done at a time, at the moment."""
+        """Number of tasks that the workers do at a time, at the moment."""
         try:
             workers = self._client.scheduler_info(n_workers=-1).get("workers", {})
         except (OSError, RuntimeError, TimeoutError):
@@ -137,7 +137,7 @@ class _WatchedExecutor(Executor):
             future.set_result(inner.result())
 
     def _watch(self):
-        """Done by a thread: count the workers, and give up when there are none for too long."""
+        """Count the workers, in a thread, and give up when there are none for too long."""
         since, said = None, False
         while not self._ended.wait(_PERIOD):
             if self._has_workers():
@@ -159,7 +159,7 @@ class _WatchedExecutor(Executor):
 
     def _has_workers(self):
         try:
-            # A client that has lost its scheduler knows nothing of workers.
+            # A client that has lost its scheduler knows no workers.
             return bool(self._client.scheduler_info(n_workers=-1).get("workers"))
         except (OSError, RuntimeError, TimeoutError):
             return False

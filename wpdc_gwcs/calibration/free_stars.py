@@ -26,7 +26,7 @@ _ROUNDS = 3
 # Stars of two or more exposures that must be there, to tell the errors of either side.
 _LEAST_STARS = 20
 
-# Stated errors may be wrong by so much, and no more.
+# Least and greatest factor by which stated errors may be wrong.
 _LEAST_SCALE, _MOST_SCALE = 0.2, 10.0
 
 _MAS = 3.6e6  # per deg

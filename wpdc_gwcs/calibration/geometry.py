@@ -383,7 +383,7 @@ def _priors(widths, columns, plane):
 def _solve(parts, widths, columns, plane):
     """Posterior of all unknowns: means of both axes, covariance of one; residuals go to the parts.
 
-    Unknowns are in units of their priors: well scaled, whatever they are.
+    Unknowns are in units of their priors, so they are well scaled.
     """
     prior = _priors(widths, columns, plane)
     normal, right = np.eye(len(prior)), np.zeros((len(prior), 2))

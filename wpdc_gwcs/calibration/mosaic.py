@@ -6,9 +6,9 @@
           ^                                                                       |
           '-------------------------- until none is added ------------------------'
 
-A detector of few stars, or one whose header is too wrong, cannot be matched alone.  Its neighbors
-in the same exposure know pointing, rotation and scale, other exposures of the camera know its place
-in the focal plane: what is left to search is so little that six pairs are proof.
+A detector with few stars, or with a header that is far off, cannot be matched alone.  Its neighbors
+in the same exposure determine pointing, rotation and scale, and other exposures of the camera
+determine its place in the focal plane.  The remaining search is so narrow that six pairs are proof.
 """
 
 import logging

@@ -4,9 +4,9 @@
 
     group of frames --write--> .RUN.part/ --rename--> .RUN.done/ --move--> the folder
 
-A set is written into a hidden folder, which gets another name when it is complete: until then
-nothing has happened to what is there, from then on all of it will, even if the program is killed,
-since the next run goes on where it stopped.
+A set is written into a hidden folder, which is renamed when it is complete.  Before that, existing
+files are unchanged.  After that, the whole set will be put in place, even if the program is killed,
+because the next run continues where it stopped.
 """
 
 import json
@@ -100,7 +100,7 @@ def put_in_place(done, folder):
     Parameters
     ----------
     done : Path
-        Folder with the whole set, or what is left of it; it is removed.
+        Folder with the set, or the remaining files of it; it is removed.
     folder : Path
         Where they go.
     """

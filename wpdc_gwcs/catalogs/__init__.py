@@ -9,8 +9,8 @@
 Missing motions are filled in from the whole catalog, before the cut, so that a star moves the same
 way in all frames.
 
-The checked table has plain float64 columns with fixed names and units, whatever their names and
-units in the input:
+The checked table has plain float64 columns with fixed names and units, regardless of their names
+and units in the input:
 
 ===================== ======== =================================================================
 column                unit     meaning

@@ -241,7 +241,7 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
     period = 2 if has_pattern(data, bad, scale) else 1
     bright = _bright_pixels(data, pedestal + _BRIGHT * scale)
     image = _in_units(data, pedestal, unit, overwrite=overwrite)
-    # Where nobody else has it, its memory is free for what follows.
+    # If there is no other reference to it, its memory becomes free.
     del data
     if blank is not None:
         image[blank] = 0

@@ -4,12 +4,12 @@ import numpy as np
 
 __all__ = ["plateau", "saturation_problem"]
 
-# A level stated for saturation belongs to other pixels if the brightest exceed it so many times:
-# flat fields and stacks make less of it.
+# A stated saturation level is wrong if the brightest pixels exceed it by this factor; flat fields
+# and stacks cause smaller factors.
 _MAX_EXCESS = 3.0
-# Pixels that are cut off at less than this share of it are saturated there.
+# If pixels are cut off below this fraction of it, they are saturated there.
 _BELOW = 0.95
-# Levels within so many standard deviations of the background are those of the sky.
+# Levels within this many standard deviations of the background are those of the sky.
 _ABOVE_SKY = 10.0
 
 

@@ -110,7 +110,7 @@ def detect_drift(solution, matches, *, false_alarm=0.01):
        (turbulence is common to the stars of one cell).  A single frame may differ by as much as the
        frames of the solution did.
     2. The most significant cell, its probability multiplied by the number of cells (Bonferroni,
-       which holds whatever the correlation between cells), and the chi-square of the whole
+       which holds for any correlation between cells), and the chi-square of the whole
        detector, which accounts for correlated errors of the table, share the false alarms equally.
     3. The attitudes of the frames have absorbed the linear part of a change.  It is found from the
        largest set of cells that agree on a linear map, by a robust fit from many starting points.

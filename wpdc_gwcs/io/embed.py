@@ -130,7 +130,7 @@ def write_into(
         for other, part in enumerate(parts):
             if other != number:
                 gone -= tables_of(part.header)
-    # Tables of a WCS are never images to choose from, whatever their names.
+    # Tables of a WCS are not offered as images, under any name.
     kept = [
         part
         for k, part in enumerate(parts)

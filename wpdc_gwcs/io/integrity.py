@@ -134,8 +134,8 @@ def content_sum(tree):
     Returns
     -------
     str
-        SHA-256 in hexadecimal digits; the same for the same names and values, whatever their order
-        and the form in which the file holds them.
+        SHA-256 in hexadecimal digits, which depends on names and values only, not on their order or
+        their form in the file.
     """
     digest = hashlib.sha256()
     _add(digest, tree)

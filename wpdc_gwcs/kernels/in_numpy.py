@@ -483,7 +483,7 @@ def rows_to_sky(plane, cells, tangent, x, y, ra, dec):
 
 
 def _cells_of_rows(plane, x, y, collapsed):
-    """Return the values of the cells along rows; what is left of a row of cells is kept."""
+    """Return the values of the cells along rows; the coefficients of a row of cells are kept."""
     x_low, _, x_step, y_low, _, y_step, nx, ny = plane.head[:8]
     j, t = _locate(y, y_low, y_step, ny)
     j[np.isnan(j)] = 0.0

@@ -373,8 +373,8 @@ def select_coherent(
         & (np.abs(h.log_scale[:, None] - h.log_scale[None]) <= slack)
         & (np.abs(h.rotation[:, None] - h.rotation[None]) <= slack)
     )
-    # an agreement is worth what is left of the other's surprise after all the stars among which it
-    # could have been picked; scale and rotation must fit as well
+    # An agreement counts as the surprise of the other one, less that of a choice among all stars
+    # in reach.  Scale and rotation must agree as well.
     share = np.minimum(1.0, (slack / max_difference) ** 2)
     worth = h.surprise[None] - np.log10((1 + density * np.pi * tolerance**2) * share)
     worth = np.where(agree & (h.source[:, None] != h.source[None]), np.maximum(worth, 0.0), 0.0)

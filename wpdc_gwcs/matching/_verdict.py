@@ -41,8 +41,8 @@ _FEW = 100
 # Significance and purity below which the pairs of a subset are not carried to the whole frame: it
 # only spares hopeless starts the full round.
 _HOPELESS_SIGNIFICANCE, _HOPELESS_PURITY = 4.0, 0.5
-# Of two matches, the one with less than this share of the evidence (in -2 ln P) of the other is
-# worse; and the better one of two is looked for so many times.
+# Of two matches, the one with less than this fraction of the evidence (in -2 ln P) of the other is
+# worse; and the greatest number of times that a better one is searched for.
 _EQUAL = 0.7
 _MOST_RIVALS = 4
 # Pairs agree with a match within this many radii; "most" means more than this fraction.

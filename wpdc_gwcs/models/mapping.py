@@ -187,11 +187,11 @@ class PlaneMap:
 
         Notes
         -----
-        Iterates first stay on the grid and one cell around it: for a point that lies there the way
-        is only shortened by that.  What is left with a residual lies farther out, where the map is
-        the polynomial and straight lines: Newton's method goes on for it without bounds.  A point
-        where the Jacobian determinant has another sign than in the middle (the image is folded over
-        there) is no answer.
+        At first, the iteration is confined to the grid and one cell around it, which only helps
+        points that lie there.  Points that still have a residual lie farther out, where the map is
+        the polynomial plus linear functions, and Newton's method continues without bounds.  A point
+        where the Jacobian determinant has a different sign than at the center, because the image is
+        folded there, is not a solution.
         """
         limits = np.array([tolerance, self._curvature, self._orientation, RIM_PX])
         return self._inverse(self._start, limits, tangent, kernels.box_numbers(box, fill_value))

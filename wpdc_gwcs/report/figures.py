@@ -54,7 +54,7 @@ def detector_figures(name, solution, table, *, small=False):
                 _embed(
                     axes[0, 0].figure,
                     f"distortion and residuals of {name}",
-                    "Left: the distortion that is taken off.  Right: what is left.  Arrows are "
+                    "Left: the distortion that is corrected.  Right: the residuals.  Arrows are "
                     "means of 20 x 20 cells.",
                     **(_SMALL if small else _LARGE),
                 )

@@ -38,7 +38,7 @@ def sky_map(wcs, *, image_shape=None, out=None):
 
     Notes
     -----
-    In addition to the outputs, it needs some megabytes, whatever the size of the image.
+    In addition to the outputs, it needs a few megabytes, for images of any size.
 
     Examples
     --------
