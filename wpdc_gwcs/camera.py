@@ -45,6 +45,17 @@ class Camera:
         `DistortionSolution` of each detector; on disk, these are separate files.
     provenance : dict
         Origin of the camera.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import calibrate, simulate
+    >>> sky = simulate(1, camera="bass-90prime", image_shape=(512, 512), density=30, distortion=12,
+    ...                seed=2)
+    >>> run = calibrate([exposure.frame() for exposure in sky.exposures], sky.reference)
+    >>> camera = run.cameras[0]
+    >>> camera.detectors
+    ('CCD1', 'CCD2', 'CCD3', 'CCD4')
+    >>> x, y = camera.focal_plane("CCD1", 100.0, 200.0)
     """
 
     name: str

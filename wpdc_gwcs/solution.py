@@ -92,6 +92,19 @@ class DistortionSolution(InMemory):
     valid_from, valid_to : float, optional
         Epochs (Julian years) from which, and until which, the solution is valid; `None` if there is
         no known limit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import Calibration, DistortionSolution, PVPolynomial
+    >>> cd = np.array([[-8e-5, 0.0], [0.0, 8e-5]])
+    >>> solution = DistortionSolution(
+    ...     detector="d1", image_shape=(1024, 1024), crpix=np.array([511.5, 511.5]), cd=cd,
+    ...     crval=np.array([10.0, 45.0]), pv=PVPolynomial(pv1_7=4.0, pv2_7=-3.0)
+    ... )
+    >>> ra, dec = solution.wcs(511.5, 511.5)
+    >>> print(f"{ra:.6f} {dec:.6f}")
+    10.000000 45.000000
     """
 
     detector: str
@@ -289,6 +302,22 @@ class Calibration(InMemory):
         Pairs and sources of the frame, with units.
     statistics, settings, provenance : dict
         How the calibration was made; immutable.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import Calibration, DistortionSolution, PVPolynomial
+    >>> cd = np.array([[-8e-5, 0.0], [0.0, 8e-5]])
+    >>> solution = DistortionSolution(
+    ...     detector="d1", image_shape=(1024, 1024), crpix=np.array([511.5, 511.5]), cd=cd,
+    ...     crval=np.array([10.0, 45.0]), pv=PVPolynomial(pv1_7=4.0, pv2_7=-3.0)
+    ... )
+    >>> calibration = Calibration("a", solution, crval=np.array([10.1, 45.1]), cd=1.0001 * cd)
+    >>> ra, dec = calibration.wcs(511.5, 511.5)
+    >>> print(f"{ra:.6f} {dec:.6f}")
+    10.100000 45.100000
+    >>> calibration.to_header("tpv")["CTYPE1"]
+    'RA---TPV'
     """
 
     frame: str

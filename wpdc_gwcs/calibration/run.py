@@ -189,6 +189,18 @@ def calibrate(
     References
     ----------
     WPDC-2P, arXiv:2603.09193.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import calibrate, simulate
+    >>> sky = simulate(2, image_shape=(1000, 1000), density=30, distortion=10, seed=2)
+    >>> run = calibrate([exposure.frame() for exposure in sky.exposures], sky.reference)
+    >>> [str(status) for status in run.summary["status"]]
+    ['solved', 'solved']
+    >>> wcs = run.calibrations[0].wcs
+    >>> x, y = wcs.invert(*wcs(100.0, 200.0))
+    >>> print(f"{x:.6f} {y:.6f}")
+    100.000000 200.000000
     """
     frames = _as_frames(frames)
     settings = Settings() if settings is None else settings

@@ -76,6 +76,19 @@ class Settings:
         One solution of all exposures with learned priors (``wpdc``), or WPDC-2P exactly as
         published (``paper``), for comparison: a polynomial for each exposure about the tangent
         point of its header, and raw residuals in a bilinear table.
+
+    Raises
+    ------
+    ValueError
+        If an option has a wrong value, or does not go with the method.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from wpdc_gwcs import Settings
+    >>> settings = Settings(refine="attitude", holdout=0.2)
+    >>> replace(settings, min_snr=20).holdout
+    0.2
     """
 
     weight: str = "exp-sqrt"

@@ -34,6 +34,12 @@ class HatsCatalog:
     ------
     CatalogError
         If there is no such catalog.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import HatsCatalog, calibrate
+    >>> catalog = HatsCatalog("gaia_dr3")  # doctest: +SKIP
+    >>> run = calibrate(frames, catalog)  # doctest: +SKIP
     """
 
     path: str | Path

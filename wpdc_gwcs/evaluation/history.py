@@ -151,6 +151,16 @@ def track_drift(solution, periods, *, false_alarm=0.01):
     ------
     ValueError
         If there is no period, or ``false_alarm`` is not between 0 and 1.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import calibrate, simulate, track_drift
+    >>> sky = simulate(3, image_shape=(1000, 1000), density=30, distortion=10, seed=2)
+    >>> run = calibrate([exposure.frame() for exposure in sky.exposures], sky.reference)
+    >>> periods = [([2016.0], [calibration.matches]) for calibration in run.calibrations]
+    >>> history = track_drift(run.solutions["sim"], periods)
+    >>> len(history.periods)
+    3
     """
     rows, cells = [], []
     for k, (epochs, matches) in enumerate(periods):

@@ -94,6 +94,20 @@ def make_form(obj, form, *, degree=None, versions: Mapping = MappingProxyType({}
         If the form is unknown, or has no polynomials of this degree.
     FileFormatError
         If the shape of the detector is needed and unknown.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import DistortionSolution, PVPolynomial
+    >>> from wpdc_gwcs.export import make_form
+    >>> solution = DistortionSolution(
+    ...     detector="d1", image_shape=(1024, 1024), crpix=np.array([511.5, 511.5]),
+    ...     cd=np.array([[-8e-5, 0.0], [0.0, 8e-5]]), crval=np.array([10.0, 45.0]),
+    ...     pv=PVPolynomial(pv1_7=4.0, pv2_7=-3.0)
+    ... )
+    >>> made = make_form(solution, "sip")
+    >>> made.header["CTYPE1"], made.deviation < 1e-3
+    ('RA---TAN-SIP', True)
     """
     if form not in FORMS:
         raise ValueError(f"format must be one of {', '.join(FORMS)}, got {form!r}")

@@ -46,6 +46,15 @@ def solve_linear(design, target, weight=None, *, leverage=False):
     ------
     FitError
         If there are fewer rows of non-zero weight than columns, or the columns are not independent.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.fitting import solve_linear
+    >>> x = np.arange(5.0)
+    >>> solution = solve_linear(np.column_stack([np.ones(5), x]), 3 + 2 * x)
+    >>> solution.parameters.round(12).tolist(), int(solution.rank)
+    ([3.0, 2.0], 2)
     """
     n, p = design.shape
     if weight is not None:

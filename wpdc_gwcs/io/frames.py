@@ -165,6 +165,16 @@ def read_frames(
     The camera comes from ``INSTRUME``, else from ``TELESCOP``.  Frames of one camera belong to one
     exposure if ``EXPNUM``, ``OBSID`` or a similar keyword is the same or, if there is none, the
     start time.  Frames of one file always do, unless such a keyword differs.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from wpdc_gwcs import read_frames, simulate
+    >>> from wpdc_gwcs.simulation import write_simulation
+    >>> sky = simulate(1, image_shape=(256, 256), density=30, distortion=2, seed=1)
+    >>> files = write_simulation(sky, tempfile.mkdtemp(), images=(0,))
+    >>> [(frame.name, frame.image_shape) for frame in read_frames(files["frames"][0])]
+    [('sim-01', (256, 256))]
     """
     if origin not in (None, 0, 1):
         raise ValueError(f"origin must be 0 or 1, got {origin!r}")

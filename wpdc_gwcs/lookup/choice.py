@@ -95,6 +95,21 @@ def choose_table(residual_map, *, lut="auto"):
     ------
     FitError
         If ``lut`` is ``always`` and the map has too few stars.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import ResidualMap
+    >>> from wpdc_gwcs.lookup import choose_table
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 2047, (2, 4000))
+    >>> dx, dy = np.sin(x / 300) + rng.normal(0, 0.05, (2, 4000))
+    >>> bins = ResidualMap.from_residuals(
+    ...     x, y, dx, dy, x_err=0.05, y_err=0.05, image_shape=(2048, 2048)
+    ... )
+    >>> choice, candidates = choose_table(bins)
+    >>> choice == candidates[0], choice.kernel == "none"
+    (True, False)
     """
     if not carries_table(residual_map):
         if lut == "always":

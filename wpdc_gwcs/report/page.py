@@ -87,6 +87,18 @@ def write_report(summary, solutions, matches, file, *, title="Calibration report
     72.  For a survey, 100 frames of each detector, chosen evenly, are pooled.  The tables have the
     500 frames that failed, are degraded or have the largest residuals, and the worst 100 of them
     have figures.
+
+    Examples
+    --------
+    >>> import io
+    >>> from wpdc_gwcs import calibrate, simulate, write_report
+    >>> sky = simulate(1, image_shape=(512, 512), density=30, distortion=5, seed=2)
+    >>> run = calibrate([exposure.frame() for exposure in sky.exposures], sky.reference)
+    >>> matches = {c.frame: c.matches for c in run.calibrations}
+    >>> file = io.StringIO()
+    >>> write_report(run.summary, run.solutions, matches, file, title="Night 1")
+    >>> "<title>Night 1</title>" in file.getvalue()
+    True
     """
     from jinja2 import Environment
 

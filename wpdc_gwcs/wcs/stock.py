@@ -57,6 +57,19 @@ def to_stock_wcs(wcs):
     stored with the WCS, and is accurate to 1e-4 px unless the look-up table varies from node to
     node.  gwcs itself masks positions outside the range of right ascension and declination of the
     corners, so near a pole use ``stock.invert(ra, dec, with_bounding_box=False)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import DistortionSolution, PVPolynomial, to_stock_wcs
+    >>> solution = DistortionSolution(
+    ...     detector="d1", image_shape=(1024, 1024), crpix=np.array([511.5, 511.5]),
+    ...     cd=np.array([[-8e-5, 0.0], [0.0, 8e-5]]), crval=np.array([10.0, 45.0]),
+    ...     pv=PVPolynomial(pv1_7=4.0, pv2_7=-3.0)
+    ... )
+    >>> stock = to_stock_wcs(solution.wcs)
+    >>> bool(np.allclose(stock(100.0, 900.0), solution.wcs(100.0, 900.0), rtol=0, atol=1e-10))
+    True
     """
     transforms = [step.transform for step in wcs.pipeline[:-1]]
     if list(map(type, transforms)) != [DistortionCorrection, TangentSky]:
