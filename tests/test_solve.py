@@ -576,6 +576,27 @@ class TestRobustness:
         assert sigma.max() > 1.0
         assert frame_of(result, 0).uncertainty(150.0, 150.0)[0] < 0.03
 
+    @pytest.mark.parametrize(("off", "n"), [(0.0, 1), (1.0, 1), (0.3, 3)])
+    def test_star_that_holds_a_corner(self, rng, off, n):
+        """A star that the model follows is judged by what the others predict for its place."""
+        field = Field(rng, n=n, stars=500)
+        lone = []
+        for k, e in enumerate(field.exposures):
+            near = np.hypot(e.x, e.y - SHAPE[0]) < 350
+            i = np.flatnonzero(near)[0]
+            e.x[i], e.y[i], e.x_err[i], e.y_err[i] = 25.0, 1970.0, 0.015, 0.015
+            e.ra[i], e.dec[i] = field.sky(k, e.x[i], e.y[i])
+            near[i] = False
+            field.exposures[k] = replace(e, use=~near)
+            lone.append(i)
+        field.exposures[0].y[lone[0]] += off
+        result = field.solve()
+        used = [fit.used[i] for fit, i in zip(result.exposures, lone)]
+        assert used == [off == 0.0] + [True] * (n - 1)
+        error = field.errors(result, 0)[:, -1, 0]
+        sigma = np.array(frame_of(result, 0).uncertainty(0.0, SHAPE[0] - 1.0)[:2])
+        assert np.all(np.abs(error) < 3 * sigma)
+
     def test_no_stars_within_r0(self, rng):
         """The polynomial is that of the map, not of the stars of full weight."""
         field = Field(rng, n=1, stars=800)

@@ -212,7 +212,7 @@ def solve(
                 break
             state = linear_step(o, state, learn=_LEARN, pool=pool_attitudes)
             state = with_fields(o, state)
-            state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE)
+            state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE, leverage=True)
             # Former scatter is now part of the field, so the errors are smaller.
             state = with_error_models(o, state)
             if waves:
@@ -335,7 +335,8 @@ def _align(o, state, clip, pool):
     for turn in range(_ROUNDS_ALIGN):
         state = linear_step(o, state, learn=_LEARN, pool=pool)
         # Distortion that is not yet in the model is not noise: clip little at first.
-        state = with_clipping(o, state, clip, relax=max(1.0, 4.0 / 2**turn))
+        last = turn == _ROUNDS_ALIGN - 1
+        state = with_clipping(o, state, clip, relax=max(1.0, 4.0 / 2**turn), leverage=last)
         if turn and not o.has_errors.all():
             state = with_error_models(o, state)
     state = without_wrong(o, state)
@@ -345,9 +346,9 @@ def _align(o, state, clip, pool):
 
 def _settled(o, state, clip, pool):
     """State with all terms, fields and outliers for the present tables."""
-    for _ in range(2):
+    for last in (False, True):
         state = linear_step(o, state, learn=1, pool=pool)
-        state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE)
+        state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE, leverage=last)
     return with_fields(o, state) if any(state.spectra.values()) else state
 
 

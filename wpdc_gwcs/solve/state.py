@@ -7,6 +7,7 @@ import logging
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from wpdc_gwcs.solve.errors import (
     MODE_NAMES,
@@ -30,8 +31,13 @@ _MIN_EXPOSURES_POOL = 5
 # Linear maps that differ by more than this are intentional (another roll of the camera).
 _MAX_POOLED = 0.05
 
-# With more stars than this in a frame, leverages are negligible.
-_MAX_STARS_LEVERAGE = 200
+# With more stars than this in a frame, the leverage of most is negligible: it is computed for those
+# that tell more of their own place than all others do, which are found by the variance of the model
+# on so many nodes along each axis, for it is smooth.
+_MANY_STARS, _LARGE_LEVERAGE, _NODES = 200, 0.5, 9
+
+# Rounding errors of a leverage near one.
+_MAX_LEVERAGE = 0.999
 
 # Minimum learned standard deviations, px: of any group; of color terms, per magnitude.
 _LEAST_SIGMA, _LEAST_COLOR = 1e-9, 1e-4
@@ -338,7 +344,7 @@ def all_residuals(o, state, *, with_field=True):
     return out
 
 
-def with_clipping(o, state, clip, *, local=np.inf, relax=1.0):
+def with_clipping(o, state, clip, *, local=np.inf, relax=1.0, leverage=False):
     """Return the state with outliers clipped again; see `clip_outliers`.
 
     Parameters
@@ -353,27 +359,54 @@ def with_clipping(o, state, clip, *, local=np.inf, relax=1.0):
         How much larger residuals may be in one part of a detector.
     relax : float, optional
         Multiplies the limit.
+    leverage : bool, optional
+        Whether stars are judged by what the others predict, which takes longer.
     """
     residual = all_residuals(o, state)
-    leverage = np.zeros((2, len(o)))
-    for f in state.active:
-        s = o.slices[f]
-        if s.stop - s.start > _MAX_STARS_LEVERAGE or state.posterior is None:
-            continue
-        finite = o.finite[s]
-        variance = np.zeros((2, s.stop - s.start))
-        variance[:, finite] = predict_variance(o, state, f, o.x[s][finite], o.y[s][finite])[
-            [0, 1], [0, 1]
-        ]
-        ratio = variance / state.sigma[:, s] ** 2
-        # The residual of a fitted star is smaller than its error, that of others larger.
-        leverage[:, s] = np.where(state.kept[s], np.minimum(ratio, 0.999), -ratio)
+    share = np.zeros((2, len(o)))
+    for f in state.active if leverage else ():
+        share[:, o.slices[f]] = _leverage(o, state, f)
     usable = np.zeros(len(o), bool)
     for f in state.active:
         usable[o.slices[f]] = True
     limited = replace(o, valid=o.valid & usable)
-    kept = clip_outliers(limited, residual, state.sigma, leverage, clip, local=local, relax=relax)
+    kept = clip_outliers(limited, residual, state.sigma, share, clip, local=local, relax=relax)
     return replace(state, kept=kept)
+
+
+def _leverage(o, state, frame):
+    """Leverage of the pairs of a frame ``(2, N)``; zero where it is negligible.
+
+    The residual of a fitted star is smaller than its error, that of others is larger: theirs is
+    negative.
+    """
+    s, spectrum = o.slices[frame], state.spectrum(o, frame)
+    # Waves that are too short for the field are noise.
+    basis = state.bases.get(int(o.detector_of[frame]))
+    noise = 0.0 if spectrum is None else spectrum.unresolved(basis)
+
+    def variances(x, y):
+        # Waves of the pixels are not of the linear step: they would count some stars twice.
+        covariance = predict_variance(o, state, frame, x, y, static=False)
+        return covariance[[0, 1], [0, 1]] - noise
+
+    x, y, own = o.x[s], o.y[s], state.sigma[:, s] ** 2 + noise
+    told = np.flatnonzero(o.finite[s])
+    many = len(told) > _MANY_STARS
+    if many:
+        detector = o.detector(frame)
+        nodes = variances(*detector.grid(_NODES)).reshape(2, _NODES, _NODES)
+        largest = maximum_filter(nodes, (1, 2, 2), origin=(0, -1, -1))[:, :-1, :-1]
+        column, row = (
+            np.clip((0.5 * (w + 1.0) * (_NODES - 1)).astype(int), 0, _NODES - 2)
+            for w in detector.normalized(x[told], y[told])
+        )
+        told = told[np.any(largest[:, row, column] > _LARGE_LEVERAGE * own[:, told], axis=0)]
+    out = np.zeros(own.shape)
+    if len(told):
+        share = variances(x[told], y[told]) / own[:, told]
+        out[:, told] = np.where(state.kept[s][told], np.minimum(share, _MAX_LEVERAGE), -share)
+    return np.where(np.abs(out).max(0) > _LARGE_LEVERAGE, out, 0.0) if many else out
 
 
 def with_error_models(o, state):
@@ -415,7 +448,9 @@ def with_error_models(o, state):
     return replace(state, sigma=sigma, error_models=models)
 
 
-def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrument_only=False):
+def predict_variance(
+    o, state, frame, x, y, *, table=None, growth=None, instrument_only=False, static=True
+):
     """Return the covariance of calibrated positions of pixels, without centroid errors.
 
     Parameters
@@ -435,6 +470,8 @@ def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrume
         Factors of the standard deviations of the shared terms, see `extrapolation`.
     instrument_only : bool, optional
         Leave out the exposure's own numbers and field.
+    static : bool, optional
+        Whether the waves that belong to the pixels are part of it.
 
     Returns
     -------
@@ -462,7 +499,7 @@ def predict_variance(o, state, frame, x, y, *, table=None, growth=None, instrume
 
     conditional = product(found.conditional[e], own)
     instrument = product(found.joint(k, e), rows) - conditional
-    if k in model.statics:
+    if static and k in model.statics:
         instrument = instrument + model.statics[k].covariance(
             block(model, k, o.detectors[k], x, y)[1]
         )
