@@ -286,11 +286,10 @@ def test_models_are_taken_off_the_image_itself(frame):
     np.testing.assert_allclose(again["x_err"][good], whole["x_err"][good], rtol=5e-3)
 
 
-def test_parts_and_threads_change_nothing(frame, monkeypatch):
+def test_parts_of_the_work_change_nothing(frame, monkeypatch):
     for module, name, size in ((_fit, "_CHUNK", 60), (_blends, "_CHUNK", 60)):
         monkeypatch.setattr(module, name, size)
     monkeypatch.setattr(_residual, "_STRIP", 40 * SHAPE[1])
-    monkeypatch.setattr("wpdc_gwcs.threads.count_threads", lambda: 3)
     sources, expected = frame["sources"], frame["result"]
     again = fit_centroids(frame["background"], sources, frame["epsf"], gain=GAIN)
     for name in expected.colnames:

@@ -8,7 +8,6 @@ from scipy.ndimage import percentile_filter
 
 from wpdc_gwcs import kernels
 from wpdc_gwcs.cutouts import cut_squares, on_image
-from wpdc_gwcs.threads import map_threads
 
 __all__ = [
     "Field",
@@ -21,7 +20,7 @@ __all__ = [
 ]
 
 # Stars fitted at a time: bounds the memory for their pixels.
-_CHUNK = 2000
+_CHUNK = 4000
 
 _MAX_STEP = 0.5  # px per iteration
 _MAX_ITERATIONS = 12
@@ -250,13 +249,11 @@ def fit_stars(field, profile, noise, stars, *, radius, own=None):
     StarFits
         The fits.
     """
-
-    def fit(start):
+    parts = []
+    for start in range(0, max(len(stars.x), 1), _CHUNK):
         rows = slice(start, start + _CHUNK)
         mine = None if own is None else own.take(rows)
-        return _fit_chunk(field, profile, noise, stars.take(rows), radius, mine)
-
-    parts = map_threads(fit, range(0, max(len(stars.x), 1), _CHUNK))
+        parts.append(_fit_chunk(field, profile, noise, stars.take(rows), radius, mine))
     x, y, flux, *rest = (np.concatenate(columns) for columns in zip(*parts))
     return StarFits(Stars(x, y, flux), *rest)
 

@@ -2,14 +2,12 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from queue import Empty, SimpleQueue
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from wpdc_gwcs.centroids._fit import Stars
 from wpdc_gwcs.centroids._profile import Profile
-from wpdc_gwcs.threads import map_threads
 
 __all__ = ["Painter", "Residual", "Scene"]
 
@@ -113,7 +111,7 @@ class Scene:
 
     Notes
     -----
-    Only what has changed is drawn, in strips, several at a time: there is no image of all models.
+    Only what has changed is drawn, in strips: there is no image of all models.
     """
 
     def __init__(self, data, profile, drawn):
@@ -153,34 +151,25 @@ class Scene:
         candidates = _near_any(stars, changed, self._painter.half(both.flux).max() + margin + 1)
         row = np.clip(np.rint(stars.y[candidates]), 0, len(image) - 1)
         candidates, row = candidates[order := np.argsort(row)], row[order]
-        lit = _lit_rows(models, len(image))
         step = max(1, _STRIP // image.shape[1])
-        strips = [slice(k, min(k + step, len(image))) for k in range(0, len(image), step)]
-        # An image for each thread, dark again after each strip.
-        works = SimpleQueue()
-
-        def draw_strip(rows):
-            low, high = max(rows.start - margin, 0), min(rows.stop + margin, len(image))
-            try:
-                work = works.get_nowait()
-            except Empty:
-                work = np.zeros((step + 2 * margin, image.shape[1]), np.float32)
+        work = np.zeros((step + 2 * margin, image.shape[1]), np.float32)
+        lit = _lit_rows(models, len(image))
+        found = [np.zeros(0, int)]
+        for first in range(0, len(image), step):
+            last = min(first + step, len(image))
+            low, high = max(first - margin, 0), min(last + margin, len(image))
             light = work[: high - low]
             for one in models:
                 one.paint(light, first_row=low)
-            for start, stop in _runs(lit[rows]):
-                k = slice(rows.start + start, rows.start + stop)
-                image[k] -= light[k.start - low : k.stop - low]
-            k = candidates[slice(*np.searchsorted(row, [rows.start, rows.stop]))]
+            for start, stop in _runs(lit[first:last]):
+                image[first + start : first + stop] -= light[first - low :][start:stop]
+            k = candidates[slice(*np.searchsorted(row, [first, last]))]
             if len(k):
                 sides = old.take(k), stars.take(k)
-                k = k[self._disturbed(light, low, *sides, changed[k], radius, settled)]
+                found.append(k[self._disturbed(light, low, *sides, changed[k], radius, settled)])
             for start, stop in _runs(lit[low:high]):
                 light[start:stop] = 0
-            works.put(work)
-            return k
-
-        return np.sort(np.concatenate(map_threads(draw_strip, strips)))
+        return np.sort(np.concatenate(found))
 
     def _disturbed(self, light, low, old, new, changed, radius, settled):
         """Mark the stars in whose pixels there is light that is not their own."""
@@ -271,7 +260,7 @@ class Residual:
         """
         part = self.background.rows(start, stop)
         image = part.image if self.subtracted else np.empty_like(part.image)
-        rms = np.array(part.rms, np.float32)
+        rms = np.array(part.rms, np.float32, order="C")
         step = max(1, _CACHED // part.shape[1])
         work = np.empty((min(step, len(rms)), part.shape[1]), np.float32)
         for first in range(0, len(rms), step):
