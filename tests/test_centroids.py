@@ -6,8 +6,11 @@ from scipy.interpolate import BSpline
 from scipy.special import erf
 
 from wpdc_gwcs.centroids import (
+    _blends,
     _build,
+    _fit,
     _profile,
+    _residual,
     build_epsf,
     fit_centroids,
     measure_psf,
@@ -281,6 +284,16 @@ def test_models_are_taken_off_the_image_itself(frame):
         off = (again[name] - whole[name])[good] / whole["x_err"][good]
         assert np.abs(off).max() < 0.02
     np.testing.assert_allclose(again["x_err"][good], whole["x_err"][good], rtol=5e-3)
+
+
+def test_parts_of_the_work_change_nothing(frame, monkeypatch):
+    for module, name, size in ((_fit, "_CHUNK", 60), (_blends, "_CHUNK", 60)):
+        monkeypatch.setattr(module, name, size)
+    monkeypatch.setattr(_residual, "_STRIP", 40 * SHAPE[1])
+    sources, expected = frame["sources"], frame["result"]
+    again = fit_centroids(frame["background"], sources, frame["epsf"], gain=GAIN)
+    for name in expected.colnames:
+        np.testing.assert_allclose(again[name], expected[name], rtol=1e-9, err_msg=name)
 
 
 def test_residuals_are_the_same_in_strips_and_whole(frame):

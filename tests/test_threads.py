@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from wpdc_gwcs.threads import count_threads, map_threads
+from wpdc_gwcs.threads import count_threads, map_threads, share_processors
 
 
 def test_results_come_in_the_order_of_the_items(monkeypatch):
@@ -34,3 +34,12 @@ def test_errors_come_through(monkeypatch):
 
 def test_threads_are_few():
     assert 1 <= count_threads() <= 4
+
+
+def test_processes_share_the_processors(monkeypatch):
+    monkeypatch.setattr("wpdc_gwcs.threads._n_processes", 1)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(6), raising=False)
+    assert count_threads() == 4
+    for n_processes, n_threads in ((2, 3), (6, 1), (8, 1)):
+        share_processors(n_processes)
+        assert count_threads() == n_threads

@@ -5,9 +5,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 from threadpoolctl import threadpool_limits
 
-__all__ = ["count_threads", "map_threads", "one_blas_thread"]
+__all__ = ["count_threads", "map_threads", "one_blas_thread", "share_processors"]
 
 _MAX_THREADS = 4
+# Processes that share the processors.
+_n_processes = 1
 
 #: Decorator: while the function runs, linear algebra uses one thread.  The matrices are small and
 #: many: threads gain little on an idle machine, and on a busy one they wait for each other several
@@ -24,8 +26,22 @@ def count_threads():
         Number of threads.
     """
     if hasattr(os, "sched_getaffinity"):
-        return min(_MAX_THREADS, len(os.sched_getaffinity(0)))
-    return min(_MAX_THREADS, os.cpu_count() or 1)
+        n_processors = len(os.sched_getaffinity(0))
+    else:
+        n_processors = os.cpu_count() or 1
+    return max(1, min(_MAX_THREADS, n_processors // _n_processes))
+
+
+def share_processors(n_processes):
+    """Take no more than its share of the processors in this process.
+
+    Parameters
+    ----------
+    n_processes : int
+        Number of processes that work at the same time.
+    """
+    global _n_processes
+    _n_processes = n_processes
 
 
 def map_threads(function, items):

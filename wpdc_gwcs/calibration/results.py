@@ -6,6 +6,7 @@ import shutil
 import stat
 import tempfile
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from astropy.table import Table
@@ -24,6 +25,7 @@ from wpdc_gwcs.calibration.staging import (
 )
 from wpdc_gwcs.calibration.summary import summarize
 from wpdc_gwcs.exceptions import InputError
+from wpdc_gwcs.threads import one_blas_thread
 
 __all__ = ["ERRORS", "Outcome", "ResultFolder"]
 
@@ -352,7 +354,7 @@ class ResultFolder:
                 outcome.cameras.append(read(path))
         return outcome
 
-    def write(self, group, outcome):
+    def write(self, group, outcome, workers):
         """Write the outcome of some frames completely or not at all.
 
         Parameters
@@ -361,6 +363,8 @@ class ResultFolder:
             The frames.
         outcome : Outcome
             Their results.
+        workers : Workers
+            Workers for the files of the frames.
 
         Raises
         ------
@@ -372,7 +376,7 @@ class ResultFolder:
             # Remains of an earlier group that could not be written.
             shutil.rmtree(part, ignore_errors=True)
             part.mkdir()
-            files, shared = self._write_into(part, group, outcome)
+            files, shared = self._write_into(part, group, outcome, workers)
             states = {
                 row["frame"]: {
                     "state": row["status"],
@@ -405,21 +409,15 @@ class ResultFolder:
         self._mine |= {path.name for path in part.with_suffix(".done").iterdir()}
         put_in_place(part.with_suffix(".done"), self.folder)
 
-    def _write_into(self, part, group, outcome):
+    def _write_into(self, part, group, outcome, workers):
         """Write results into a folder: files of each frame, and shared files."""
-        from wpdc_gwcs.io import write, write_table
+        from wpdc_gwcs.io import write
 
         run = self._manifest.run
         files = {frame.name: [] for frame in group}
-        for calibration in outcome.calibrations:
-            for kind in ("sources", "matches"):
-                table = getattr(calibration, kind)
-                if table is not None:
-                    name = f"{calibration.frame}.{kind}.ecsv"
-                    write_table(_of_run(table, run), part / name)
-                    files[calibration.frame].append(name)
-            write(_of_run(calibration, run), part / f"{calibration.frame}.wcs.asdf")
-            files[calibration.frame].append(f"{calibration.frame}.wcs.asdf")
+        written = workers.map(partial(_write_frame, part, run), outcome.calibrations)
+        for calibration, names in zip(outcome.calibrations, written, strict=True):
+            files[calibration.frame] = names
         # Shared files; with a stored solution they are the same in all batches.
         shared = {f"{file_stem(s.detector)}.solution.asdf": s for s in outcome.solutions.values()}
         shared |= {superseded_name(s): s for s in outcome.superseded.values()}
@@ -465,6 +463,23 @@ class ResultFolder:
         with path.open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{self._manifest.run} {name}: {error}\n{error.details}\n")
         return path
+
+
+@one_blas_thread
+def _write_frame(folder, run, calibration):
+    """Write the tables and the WCS of a frame; returns the names of the files."""
+    from wpdc_gwcs.io import write, write_table
+
+    names = []
+    for kind in ("sources", "matches"):
+        table = getattr(calibration, kind)
+        if table is not None:
+            names.append(f"{calibration.frame}.{kind}.ecsv")
+            # The folder is new: what is there is of a process that has died.
+            write_table(_of_run(table, run), folder / names[-1], overwrite=True)
+    names.append(f"{calibration.frame}.wcs.asdf")
+    write(_of_run(calibration, run), folder / names[-1], overwrite=True)
+    return names
 
 
 def _of_run(result, run):

@@ -135,7 +135,7 @@ def calibrate(
     settings : Settings, optional
         Options; the defaults work for any camera.
     jobs : int, optional
-        Number of processes that measure and match frames.
+        Number of processes that measure and match frames, and write their files.
     executor : concurrent.futures.Executor, optional
         Executor that measures and matches frames instead, for example
         ``dask.distributed.Client(...).get_executor()``.  Each frame is sent with the part of the
@@ -261,7 +261,7 @@ def calibrate(
                 if folder is not None:
                     announce("files")
                     began = time.perf_counter()
-                    folder.write(group, outcome)
+                    folder.write(group, outcome, workers)
                     log.info(
                         "files: results of %s written to %s (%.1f s)",
                         counted(len(group), "frame"), output, time.perf_counter() - began,

@@ -1,8 +1,9 @@
-"""Workers that measure and match frames: this process, other processes, or an executor.
+"""Workers that measure, match and write frames: this process, other processes, or an executor.
 
 ::
 
     Task --submit--> (this process | process of a thread | executor) --> MatchedFrame or FailedFrame
+    items --map--> (this process | processes of the threads) --> results
 
 Each process is driven by a thread through a pipe.  It ends when the pipe or the parent ends, for
 whatever reason.  A process that dies affects only its current frame.
@@ -42,7 +43,7 @@ from wpdc_gwcs.exceptions import (
     without_frames,
 )
 from wpdc_gwcs.frame import Frame
-from wpdc_gwcs.threads import one_blas_thread
+from wpdc_gwcs.threads import one_blas_thread, share_processors
 
 __all__ = ["Task", "Workers", "internal_error", "stored_of"]
 
@@ -229,7 +230,7 @@ class Workers:
             If the executor has no workers left; also raised by the callable.
         """
         if self._threads is not None:
-            future = self._threads.submit(self._in_process, task)
+            future = self._threads.submit(self._match, task)
         elif self._executor is not None:
             try:
                 future = self._executor.submit(match_or_fail, task.alone())
@@ -255,15 +256,45 @@ class Workers:
             self._futures.discard(future)
         if self._threads is None:
             return answer
-        result, messages = answer
-        for message in messages:
-            warnings.warn(message)
-        return result
+        return _result_of(answer)
 
-    def _in_process(self, task):
-        """Hand a task to the process of this thread, or to a new one if that has died."""
+    def map(self, function, items):
+        """Call a function for each item; in the processes, if there are any and they are idle.
+
+        Parameters
+        ----------
+        function : callable
+            Of one item, at the top of a module; called again if its process dies.  It works on
+            this machine, also where an executor measures and matches.
+        items : list
+            The items.
+
+        Returns
+        -------
+        list
+            Its results.
+
+        Raises
+        ------
+        WPDCError
+            What the function raises; an `InternalError` if a process dies again and again.
+        """
+        if self._threads is None or self._futures or len(items) < 2:
+            return [function(item) for item in items]
+        futures = [
+            self._threads.submit(lambda item: self._ask(ForkingPickler.dumps((function, item))), i)
+            for i in items
+        ]
         try:
-            message = ForkingPickler.dumps(task.alone())
+            return [_result_of(future.result()) for future in futures]
+        finally:
+            for future in futures:
+                future.cancel()
+
+    def _match(self, task):
+        """Match a frame in the process of this thread."""
+        try:
+            message = ForkingPickler.dumps((match_or_fail, task.alone()))
         except (PicklingError, TypeError, AttributeError, ValueError) as problem:
             reason = " ".join(str(problem).split())
             failure = FrameFailure(
@@ -271,10 +302,17 @@ class Workers:
                 f"process ({reason}): use one job"
             )
             return FailedFrame(failure, 0, 0.0), []
+        try:
+            return self._ask(message)
+        except InternalError as error:
+            return FailedFrame(error, 0, 0.0), []
+
+    def _ask(self, message):
+        """Hand work to the process of this thread, or to a new one if that has died."""
         for _ in range(_TRIES):
             process = getattr(self._mine, "process", None)
             if process is None:
-                process = self._mine.process = _Process()
+                process = self._mine.process = _Process(self._jobs)
                 self._processes.add(process)
             try:
                 if self._closed:
@@ -286,11 +324,20 @@ class Workers:
                 status = process.end()
                 if self._closed:
                     raise CancelledError from None
-        failure = InternalError(
+        raise InternalError(
             f"internal error: its process died {_TRIES} times, exit status {status} "
             "(-9: killed, mostly for want of memory)"
         )
-        return FailedFrame(failure, 0, 0.0), []
+
+
+def _result_of(answer):
+    """Take the result from the answer of a process; its warnings and errors become ours."""
+    result, messages = answer
+    for message in messages:
+        warnings.warn(message)
+    if isinstance(result, WPDCError):
+        raise result
+    return result
 
 
 def _ignore_interrupts():
@@ -303,10 +350,10 @@ def _ignore_interrupts():
 class _Process:
     """A process and the pipe to it."""
 
-    def __init__(self):
+    def __init__(self, jobs):
         context = get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self._process = context.Process(target=_serve, args=(theirs, jobs), daemon=True)
         self._process.start()
         theirs.close()
 
@@ -323,15 +370,21 @@ class _Process:
         return self._process.exitcode
 
 
-def _serve(pipe):
-    """Match frames until the parent or the pipe ends."""
+def _serve(pipe, jobs):
+    """Work until the parent or the pipe ends, as one of so many processes."""
+    share_processors(jobs)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
         while True:
-            task = pipe.recv()
+            function, item = pipe.recv()
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                result = match_or_fail(task)
+                try:
+                    result = function(item)
+                except WPDCError as error:
+                    result = without_frames(error)
+                except Exception as problem:  # noqa: BLE001  As in `match_or_fail`.
+                    result = internal_error(problem)
             # Our own warnings are about the user's data; those of libraries are about code.
             ours = [w.message for w in caught if issubclass(w.category, WPDCWarning)]
             pipe.send((result, ours))

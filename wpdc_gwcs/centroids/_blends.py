@@ -169,11 +169,13 @@ def _log_odds(share, known):
     The arguments are the shares of the light (N, K) that a companion at each place seems to have,
     and one over their errors.
     """
-    odds = [
-        np.logaddexp.reduce(light * known**2 * (share - 0.5 * light), axis=1)
-        for light in 10 ** (-0.4 * _FAINTER)
-    ]
-    return np.logaddexp.reduce(odds, axis=0) - np.log(share.shape[1] * len(odds))
+    total = []
+    for light in 10 ** (-0.4 * _FAINTER):
+        odds = light * known**2 * (share - 0.5 * light)
+        # Relative to the greatest of a star: no exponential overflows, and NumPy is quick with it.
+        most = odds.max(axis=1)
+        total.append(np.log(np.exp(odds - most[:, None]).sum(axis=1)) + most)
+    return np.logaddexp.reduce(total, axis=0) - np.log(share.shape[1] * len(total))
 
 
 def _normal(field, profile, noise, stars, modes, *, radius, subtracted):

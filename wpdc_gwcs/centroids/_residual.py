@@ -261,21 +261,20 @@ class Residual:
         """
         part = self.background.rows(start, stop)
         image = part.image if self.subtracted else np.empty_like(part.image)
-        rms = np.empty(part.shape, np.float32)
+        rms = np.array(part.rms, np.float32, order="C")
         step = max(1, _CACHED // part.shape[1])
-        work = np.empty((2, min(step, len(rms)), part.shape[1]), np.float32)
+        work = np.empty((min(step, len(rms)), part.shape[1]), np.float32)
         for first in range(0, len(rms), step):
             k = slice(first, min(first + step, len(rms)))
-            model, other = work[:, : k.stop - first]
-            variance = np.multiply(part.rms[k], part.rms[k], out=rms[k])
-            _paint(model, self._models, start + first)
+            model = _paint(work[: k.stop - first], self._models, start + first)
             if not self.subtracted:
                 np.subtract(part.image[k], model, out=image[k])
-            np.multiply(model, _MODEL_ERROR, out=other)
-            variance += np.multiply(other, other, out=other)
+            # Most pixels have no light of a star.
+            lit = np.flatnonzero(model != 0)
+            light, noise = model.reshape(-1)[lit], rms[k].reshape(-1)
+            variance = noise[lit] ** 2 + (_MODEL_ERROR * light) ** 2
             if self.gain is not None:
-                np.maximum(model, 0, out=model)
-                model /= self.gain
-                variance += model if part.photons is None else model * part.photons[k]
-            np.sqrt(variance, out=variance)
+                photons = np.maximum(light, 0) / self.gain
+                variance += photons if part.photons is None else photons * part.photons[k].flat[lit]
+            noise[lit] = np.sqrt(variance)
         return replace(part, image=image, rms=rms)

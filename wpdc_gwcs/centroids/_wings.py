@@ -64,12 +64,13 @@ def _rings(field, stars, first, last):
     xc, yc, pixels, use, sky = field.cut(stars, last, np.inf)
     step = np.arange(-last, last + 1)
     dx, dy = step - (stars.x - xc)[:, None], step - (stars.y - yc)[:, None]
-    ring = np.rint(np.hypot(dy[:, :, None], dx[:, None, :])).astype(int).reshape(use.shape)
+    ring = np.rint(np.hypot(dy[:, :, None], dx[:, None, :])).astype(np.int16).reshape(use.shape)
     use &= (ring >= first - 1) & (ring <= last)
     flux = np.broadcast_to(stars.flux[:, None], use.shape)[use]
     weight, share, ring = flux**2 / sky.variance[use], pixels[use] / flux, ring[use]
     # Weighted medians of all rings.
-    order = np.lexsort([share, ring])
+    order = np.argsort(share)
+    order = order[np.argsort(ring[order], kind="stable")]
     weight, share, ring = weight[order], share[order], ring[order]
     radius, start = np.unique(ring, return_index=True)
     total = np.cumsum(weight)

@@ -231,7 +231,7 @@ def calibrate_command(
         int, typer.Option(metavar="N", help="Seed of the choice of held-out stars.")
     ] = 0,
     jobs: Annotated[
-        int, typer.Option(metavar="N", help="Processes that measure and match frames.")
+        int, typer.Option(metavar="N", help="Processes that measure, match and write frames.")
     ] = 1,
     scheduler: Annotated[
         str | None,

@@ -3,6 +3,8 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from wpdc_gwcs.threads import count_threads
+
 __all__ = ["find_edges", "find_nearest", "one_to_one", "pair_nearest"]
 
 # Minimum number of neighbors to find for a second thread.
@@ -11,7 +13,7 @@ _THREADED = 60_000
 
 def find_nearest(tree, points, k, **options):
     """Query a tree with a useful number of threads."""
-    workers = 2 if len(points) * np.max(k) > _THREADED else 1
+    workers = min(2, count_threads()) if len(points) * np.max(k) > _THREADED else 1
     return tree.query(points, k=k, workers=workers, **options)
 
 
