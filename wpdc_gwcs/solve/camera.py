@@ -215,7 +215,7 @@ def solve(
                 break
             state = linear_step(o, state, learn=_LEARN, pool=pool_attitudes)
             state = with_fields(o, state)
-            state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE, leverage=True)
+            state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE, thorough=True)
             # Former scatter is now part of the field, so the errors are smaller.
             state = with_error_models(o, state)
             if waves:
@@ -339,7 +339,7 @@ def _align(o, state, clip, pool):
         state = linear_step(o, state, learn=_LEARN, pool=pool)
         # Distortion that is not yet in the model is not noise: clip little at first.
         last = turn == _ROUNDS_ALIGN - 1
-        state = with_clipping(o, state, clip, relax=max(1.0, 4.0 / 2**turn), leverage=last)
+        state = with_clipping(o, state, clip, relax=max(1.0, 4.0 / 2**turn), thorough=last)
         if turn and not o.has_errors.all():
             state = with_error_models(o, state)
     state = without_wrong(o, state)
@@ -351,7 +351,7 @@ def _settled(o, state, clip, pool):
     """State with all terms, fields and outliers for the present tables."""
     for last in (False, True):
         state = linear_step(o, state, learn=1, pool=pool)
-        state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE, leverage=last)
+        state = with_clipping(o, state, clip, local=_MAX_LOCAL_SCALE, thorough=last)
     return with_fields(o, state) if any(state.spectra.values()) else state
 
 

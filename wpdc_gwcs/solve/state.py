@@ -344,7 +344,7 @@ def all_residuals(o, state, *, with_field=True):
     return out
 
 
-def with_clipping(o, state, clip, *, local=np.inf, relax=1.0, leverage=False):
+def with_clipping(o, state, clip, *, local=np.inf, relax=1.0, thorough=False):
     """Return the state with outliers clipped again; see `clip_outliers`.
 
     Parameters
@@ -359,18 +359,21 @@ def with_clipping(o, state, clip, *, local=np.inf, relax=1.0, leverage=False):
         How much larger residuals may be in one part of a detector.
     relax : float, optional
         Multiplies the limit.
-    leverage : bool, optional
-        Whether stars are judged by what the others predict, which takes longer.
+    thorough : bool, optional
+        Whether stars of frames with many stars, too, are judged by what the others predict, which
+        takes longer.
     """
     residual = all_residuals(o, state)
-    share = np.zeros((2, len(o)))
-    for f in state.active if leverage else ():
-        share[:, o.slices[f]] = _leverage(o, state, f)
+    leverage = np.zeros((2, len(o)))
+    for f in state.active:
+        s = o.slices[f]
+        if thorough or s.stop - s.start <= _MANY_STARS:
+            leverage[:, s] = _leverage(o, state, f)
     usable = np.zeros(len(o), bool)
     for f in state.active:
         usable[o.slices[f]] = True
     limited = replace(o, valid=o.valid & usable)
-    kept = clip_outliers(limited, residual, state.sigma, share, clip, local=local, relax=relax)
+    kept = clip_outliers(limited, residual, state.sigma, leverage, clip, local=local, relax=relax)
     return replace(state, kept=kept)
 
 
@@ -391,22 +394,28 @@ def _leverage(o, state, frame):
         return covariance[[0, 1], [0, 1]] - noise
 
     x, y, own = o.x[s], o.y[s], state.sigma[:, s] ** 2 + noise
-    told = np.flatnonzero(o.finite[s])
-    many = len(told) > _MANY_STARS
-    if many:
-        detector = o.detector(frame)
-        nodes = variances(*detector.grid(_NODES)).reshape(2, _NODES, _NODES)
-        largest = maximum_filter(nodes, (1, 2, 2), origin=(0, -1, -1))[:, :-1, :-1]
-        column, row = (
-            np.clip((0.5 * (w + 1.0) * (_NODES - 1)).astype(int), 0, _NODES - 2)
-            for w in detector.normalized(x[told], y[told])
-        )
-        told = told[np.any(largest[:, row, column] > _LARGE_LEVERAGE * own[:, told], axis=0)]
+    told, least = np.flatnonzero(o.finite[s]), 0.0
+    if len(own[0]) > _MANY_STARS:
+        least = _LARGE_LEVERAGE
+        near = _nearby(variances, o.detector(frame), x[told], y[told])
+        told = told[np.any(near > least * own[:, told], axis=0)]
     out = np.zeros(own.shape)
     if len(told):
         share = variances(x[told], y[told]) / own[:, told]
+        share[:, share.max(0) < least] = 0.0
         out[:, told] = np.where(state.kept[s][told], np.minimum(share, _MAX_LEVERAGE), -share)
-    return np.where(np.abs(out).max(0) > _LARGE_LEVERAGE, out, 0.0) if many else out
+    return out
+
+
+def _nearby(variances, detector, x, y):
+    """Largest variance along each axis on the four nodes about each place, ``(2, N)``."""
+    nodes = variances(*detector.grid(_NODES)).reshape(2, _NODES, _NODES)
+    largest = maximum_filter(nodes, (1, 2, 2), origin=(0, -1, -1))[:, :-1, :-1]
+    column, row = (
+        np.clip((0.5 * (w + 1.0) * (_NODES - 1)).astype(int), 0, _NODES - 2)
+        for w in detector.normalized(x, y)
+    )
+    return largest[:, row, column]
 
 
 def with_error_models(o, state):
