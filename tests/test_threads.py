@@ -1,5 +1,8 @@
 """Threads change nothing but the time."""
 
+import os
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -43,3 +46,22 @@ def test_processes_share_the_processors(monkeypatch):
     for n_processes, n_threads in ((2, 3), (6, 1), (8, 1)):
         share_processors(n_processes)
         assert count_threads() == n_threads
+
+
+@pytest.mark.parametrize("given", [None, "2"])
+def test_command_line_starts_no_threads_of_linear_algebra(given):
+    """OpenBLAS starts as many threads as there are processors, unless a user says how many."""
+    code = (
+        "from wpdc_gwcs.__main__ import prepare; prepare(); import numpy, os, threadpoolctl; "
+        "print(os.environ['OPENBLAS_NUM_THREADS'], max([pool['num_threads'] for pool in "
+        "threadpoolctl.threadpool_info() if pool['internal_api'] == 'openblas'], default=1))"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    if given is not None:
+        environment["OPENBLAS_NUM_THREADS"] = given
+    ran = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    variable, threads = ran.stdout.split()
+    assert variable == (given or "1")
+    assert int(threads) <= int(variable)

@@ -18,6 +18,9 @@ def prepare():
     # NumPy requests huge pages for large arrays.  The system clears each as a whole, outside the
     # cache, which takes twice the time of clearing small pages on first use.
     os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")
+    # The linear algebra of the package uses one thread (`wpdc_gwcs.threads`).  Others that OpenBLAS
+    # starts would only spin for a while, for a tenth of the time of a small frame.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main():
