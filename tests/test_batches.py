@@ -271,11 +271,15 @@ class TestPaths:
         (folder / "empty").mkdir()
         with pytest.raises(InputError, match="empty: the folder has no FITS file"):
             expand_paths(["empty"])
+        (folder / "empty/night2").mkdir()
+        with pytest.raises(InputError, match=r"; its folders are empty/\*$"):
+            expand_paths(["empty"])
 
     def test_patterns(self, folder):
         assert expand_paths(["?.fits[SCI]"]) == ["b.fits[SCI]"]
         assert expand_paths(["*.f*"], without=["gaia.fits"]) == ["a.fits.fz", "b.fits", "f[1].fits"]
         assert expand_paths(["f[1*"]) == ["f[1].fits"]
+        assert expand_paths(["nig*"]) == ["night/g.LDAC"]
         with pytest.raises(InputError, match="x.*: no file matches this pattern"):
             expand_paths(["x*"])
         (folder / "odd*.fits").touch()

@@ -13,8 +13,9 @@ def prepare():
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     # Imports create a hundred thousand permanent objects: a search for cycles after every 700 of
-    # them takes a fifteenth of the time of a small frame.
-    gc.set_threshold(100_000, 10, 10)
+    # them takes a fifteenth of the time of a small frame.  Fewer searches than this would leave the
+    # memory of thousands of files that were read to cycles for a long time.
+    gc.set_threshold(20_000, 10, 10)
     # NumPy requests huge pages for large arrays.  The system clears each as a whole, outside the
     # cache, which takes twice the time of clearing small pages on first use.
     os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")

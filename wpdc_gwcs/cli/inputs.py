@@ -59,9 +59,12 @@ def _expand_path(one, others):
             and os.path.realpath(entry.path) not in others
         )
         if not found:
+            what = "name other files one by one"
+            if any(path.is_dir() for path in Path(one).iterdir()):
+                what = f"its folders are {os.path.join(one, '*')}"
             raise InputError(
                 f"{one}: the folder has no FITS file and no FITS_LDAC list (.fits, .fits.fz, .cat, "
-                ".ldac, ...); name other files one by one"
+                f".ldac, ...); {what}"
             )
         return found
     path, extension = re.fullmatch(r"(.*?)((?:\[[^\[\]]*\])*)", one, re.DOTALL).groups()
@@ -72,7 +75,11 @@ def _expand_path(one, others):
     found = sorted(p for p in glob.glob(pattern) if os.path.realpath(p) not in others)
     if not found:
         raise InputError(f"{one}: no file matches this pattern")
-    return [p + extension for p in found]
+    return [
+        frame
+        for p in found
+        for frame in (_expand_path(p, others) if os.path.isdir(p) else [p + extension])
+    ]
 
 
 def _lines(path):
