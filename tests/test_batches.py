@@ -1,7 +1,9 @@
 """A survey against a stored solution: batch by batch, in constant memory, one growing summary."""
 
+import gc
 import json
 import os
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -220,6 +222,28 @@ def test_calibrations_are_left_to_the_files_only_where_there_are_any(inputs):
     frames, reference, *_ = inputs
     with pytest.raises(ValueError, match="keep=False needs output"):
         calibrate(frames[:1], reference, keep=False)
+
+
+def test_batches_that_are_written_leave_the_memory(inputs, pairs, tmp_path, monkeypatch):
+    """Models refer to their parameters and back, which reference counts alone never free."""
+    frames, reference, stored, _ = inputs
+    true, held, alive = ResultFolder.write, [], []
+
+    def counting(folder, group, outcome, workers):
+        alive.append(sum(one() is not None for one in held))
+        held.extend(weakref.ref(calibration.wcs) for calibration in outcome.calibrations)
+        true(folder, group, outcome, workers)
+
+    monkeypatch.setattr(ResultFolder, "write", counting)
+    monkeypatch.setattr(run_module, "_FRAMES_PER_SEARCH", 2)
+    gc.collect()
+    gc.disable()
+    try:
+        calibrate(frames, reference, solution=stored, output=tmp_path / "out", keep=False)
+    finally:
+        gc.enable()
+    assert len(held) == 6
+    assert alive == [0, 0, 0]
 
 
 def test_a_stored_solution_stays_that_of_its_own_frames(inputs, tmp_path):

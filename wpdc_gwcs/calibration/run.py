@@ -1,5 +1,6 @@
 """A whole run: every frame matched, every detector solved, one summary."""
 
+import gc
 import itertools
 import logging
 import os
@@ -55,6 +56,10 @@ from wpdc_gwcs.threads import one_blas_thread
 __all__ = ["CalibrationRun", "calibrate"]
 
 log = logging.getLogger(__name__)
+
+# Models and their parameters refer to each other.  Their tables, a megabyte for a frame, would wait
+# for a search for cycles, which a few large objects never set off; it takes the time of one frame.
+_FRAMES_PER_SEARCH = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,6 +271,8 @@ def calibrate(
                         "files: results of %s written to %s (%.1f s)",
                         counted(len(group), "frame"), output, time.perf_counter() - began,
                     )  # fmt: skip
+                # Its tables are not to wait for the next one.
+                del outcome
     resumed = tuple(frame.name for group in done for frame in group)
     return _joined(frames, list(outcomes.values()), run_id, resumed)
 
@@ -297,7 +304,7 @@ def _outcomes(groups, run, workers):
     run.  If a cluster or the archive of the catalog is lost, the started groups come first.
     """
     other = _of_other_detectors(run.frames, run.solution)
-    counter, n_frames = itertools.count(1), sum(map(len, groups))
+    counter, n_frames, n_past = itertools.count(1), sum(map(len, groups)), 0
     run.progress("match", 0, n_frames)
     waiting, begun, lost = deque(groups), deque(), None
 
@@ -337,6 +344,11 @@ def _outcomes(groups, run, workers):
         finally:
             begun.popleft()
         yield work.group, outcome
+        n_past += len(work.group)
+        del work, results, outcome
+        if n_past >= _FRAMES_PER_SEARCH:
+            n_past = 0
+            gc.collect()
     if lost is not None:
         raise lost
     run.progress("solve", len(groups), len(groups))
