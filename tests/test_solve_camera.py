@@ -108,6 +108,28 @@ def test_poor_detector_is_right_among_good_ones(poor):
         assert rms < (2 * NOISE if frame.solution.detector == "b" else 0.02), frame.frame
 
 
+class OwnCamera(Camera):
+    """Detectors with distortions of their own: 40 px at the corners, some of it of degree 6 and 7."""
+
+    def focal(self, name, x, y):
+        u, v = np.asarray(x) / CENTER[0] - 1.0, np.asarray(y) / CENTER[1] - 1.0
+        strength = {"a": 1.0, "b": -0.8, "c": 0.6}[name]
+        dx = 20 * u * (u**2 + v**2) + 8 * (u**5 * v**2 - u**6)
+        dy = 20 * v * (u**2 + v**2) - 8 * (u**3 * v**4 - v**6)
+        return super().focal(name, x + strength * dx, y + strength * dy)
+
+
+def test_high_degrees_of_each_detector():
+    """Up to degree 5, such detectors were all refused, as if their pairs were wrong."""
+    camera = OwnCamera(np.random.default_rng(4), {"a": 60, "b": 60, "c": 60})
+    result = solve(camera.frames, image_shape=SHAPE)
+    assert result.rejected == {}
+    for k, frame in enumerate(frames_of(result, [f.detector for f in camera.frames])):
+        error, sigma = camera.errors(frame, camera.frames[k].exposure)
+        assert np.sqrt(np.mean(error**2)) < 1.6 * NOISE
+        assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.5
+
+
 def test_poor_detector_alone_is_far_worse(poor):
     camera, result = poor
     mine = [f for f in camera.frames if f.detector == "b"]

@@ -30,10 +30,9 @@ __all__ = ["solve"]
 
 log = logging.getLogger(__name__)
 
-# Default maximum degrees: of a single detector, of a detector of a mosaic, and of the optics of a
-# mosaic.
-_DEGREE_ALONE = 7
-_DEGREE_MOSAIC = 5
+# Default maximum degrees: of a detector, and of the optics of a mosaic.  Evidence keeps the highest
+# ones small; without them, sparse stars would have to tell them place by place.
+_DEGREE_DETECTOR = 7
 _DEGREE_OPTICS = 9
 
 # Degree of the delivered polynomial; the rest is in the table.
@@ -309,7 +308,7 @@ def _start(o, degree, stored):
     mosaic = len(o.detectors) > 1
     chosen = []
     if not stored:
-        largest = (_DEGREE_MOSAIC if mosaic else _DEGREE_ALONE) if degree == "auto" else degree
+        largest = _DEGREE_DETECTOR if degree == "auto" else degree
         if mosaic:
             chosen += [make.optics(_DEGREE_OPTICS), make.place(), make.tilt()]
         if largest > 1:
