@@ -109,7 +109,7 @@ def test_poor_detector_is_right_among_good_ones(poor):
 
 
 class OwnCamera(Camera):
-    """Detectors with distortions of their own: 40 px at the corners, some of it of degree 6 and 7."""
+    """Detectors with distortions of their own, 40 px at the corners, up to degree 7."""
 
     def focal(self, name, x, y):
         u, v = np.asarray(x) / CENTER[0] - 1.0, np.asarray(y) / CENTER[1] - 1.0
