@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
 from wpdc_gwcs.solve.errors import extrapolation
-from wpdc_gwcs.solve.evidence import inflation, learn_sequence
+from wpdc_gwcs.solve.evidence import inflation, learn_sequence, truncation
 
 DECAY, SCATTER = 2.5, 1.2
 
@@ -66,3 +66,21 @@ def test_errors_grow_far_from_the_stars(rng):
     many = rng.uniform(-1, 1, (2, 5000))
     assert np.all(extrapolation(many, rng.uniform(-1, 1, (2, 500))) == 1.0)
     assert np.all(extrapolation(np.zeros((2, 0)), many) > 1.0)
+
+
+@pytest.mark.parametrize("ratio", [0.2, 0.6, 0.9])
+def test_errors_grow_by_the_degrees_that_are_left_out(ratio):
+    sigma = 3.0 * ratio ** np.arange(6)
+    # The power of a degree and of all beyond it, which goes on for ever.
+    power = np.sum(sigma[-1] ** 2 * ratio ** (2 * np.arange(1000)))
+    assert_allclose(truncation(sigma, 50), np.sqrt(power) / sigma[-1], rtol=1e-9)
+    # Four places for each of the 36 coefficients up to degree 7; with more, less is hidden.
+    assert truncation(sigma, 144) == truncation(sigma, 0)
+    assert_allclose(truncation(sigma, 288) ** 2 - 1, 0.5 * (truncation(sigma, 144) ** 2 - 1))
+    assert truncation(sigma, 1e9) < 1.001
+
+
+def test_degrees_that_do_not_fall():
+    assert truncation(np.array([5.0, 1.0, 0.6, 0.6, 1.0, 0.7]), 50) < 3.3
+    assert truncation(np.array([0.1, 0.1, 0.2, 0.4]), 50) < 3.3
+    assert truncation(np.array([1.0]), 50) == 1.0

@@ -6,7 +6,7 @@ from astropy import units as u
 from numpy.testing import assert_allclose
 
 from wpdc_gwcs import calibrate, read_catalog, simulate
-from wpdc_gwcs.solve.waves import _count_places, candidates, fit_waves
+from wpdc_gwcs.solve.waves import candidates, count_places, fit_waves
 
 LOW, HIGH = np.array([-3000.0, 500.0]), np.array([1000.0, 4500.0])
 SIGMA = 0.03
@@ -71,13 +71,15 @@ def test_few_places_tell_no_waves(rng):
 
 @pytest.mark.parametrize("n", [20, 2000])
 def test_places_are_counted(rng, n):
-    spread = 40 * rng.uniform(size=(2, n))
-    assert_allclose(_count_places(spread), n, rtol=0.1)
-    assert_allclose(_count_places(np.tile(spread, 5)), _count_places(spread), rtol=0.1)
+    spread = rng.uniform(size=(2, n))
+    assert_allclose(count_places(spread), n, rtol=0.1)
+    assert_allclose(count_places(np.tile(spread, 5)), count_places(spread), rtol=0.1)
 
 
 def test_places_are_not_more_than_stars(rng):
-    assert _count_places(40 * rng.uniform(size=(2, 30_000))) == 30_000
+    assert count_places(rng.uniform(size=(2, 30_000))) == 30_000
+    assert count_places(np.zeros((2, 0))) == 0
+    assert_allclose(count_places(np.zeros((2, 1))), 1)
 
 
 @pytest.mark.parametrize("n", [1000, 8000])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-__all__ = ["inflation", "learn_sequence"]
+__all__ = ["inflation", "learn_sequence", "truncation"]
 
 # Scatter of the logarithm of the size of a group about its expectation from the group before.  It
 # is broad, because one degree of a distortion may well be ten times as large as another.
@@ -13,6 +13,14 @@ _NEWTON_STEPS = 30
 # Number of independent values that the coefficients of one degree of a detector count as.  It is
 # small: for a radial distortion, all coefficients of all degrees follow from a single value.
 _INDEPENDENT = 0.5
+
+# Degrees whose sizes tell how the spectrum of a distortion goes on beyond the last one, and the
+# largest ratio of one degree to the next that is believed: the sum of all has a limit.
+_LAST_DEGREES, _LARGEST_RATIO = 4, 0.95
+
+# Places with stars for each coefficient below which all of what is beyond the last degree remains
+# unknown; with more, fields and tables show it.
+_PLACES_PER_COEFFICIENT = 4.0
 
 
 def learn_sequence(square, count, sigma, decay):
@@ -78,3 +86,34 @@ def inflation(determined):
     """
     known = 1.0 / (1.0 / np.maximum(determined, 1e-3) + 1.0 / _INDEPENDENT)
     return float(np.exp(0.5 / np.sum(known)))
+
+
+def truncation(sigma, n_places):
+    """Return the factor by which errors grow because a distortion does not end at a degree.
+
+    Parameters
+    ----------
+    sigma : (G,) ndarray
+        Standard deviations of the coefficients of each degree, from the second on.
+    n_places : float
+        Number of places with stars.
+
+    Returns
+    -------
+    float
+        Factor on standard deviations: near 1 if the size of the degrees falls quickly, or if there
+        are many stars.
+
+    Notes
+    -----
+    If each degree is r times the one before, all of them have ``1 / (1 - r^2)`` times the power of
+    the last one.  Those beyond it are fitted by none of the coefficients, so few stars hide them in
+    the others.
+    """
+    last = np.log(sigma[-_LAST_DEGREES:])
+    if len(last) < 2:
+        return 1.0
+    ratio = min(np.exp((last[-1] - last[0]) / (len(last) - 1)), _LARGEST_RATIO)
+    terms = np.sum(np.arange(len(sigma) + 2) + 1)
+    unknown = min(_PLACES_PER_COEFFICIENT * terms / max(n_places, 1.0), 1.0)
+    return float(np.sqrt(1.0 + unknown * ratio**2 / (1.0 - ratio**2)))

@@ -8,10 +8,12 @@ from wpdc_gwcs.fitting import WPDCFitter, fit_attitude, robust_sigma
 from wpdc_gwcs.models import LookupTable, PVPolynomial, project, pv_terms
 from wpdc_gwcs.solution import DistortionSolution, covariance_of
 from wpdc_gwcs.solve.errors import extrapolation, repetition
+from wpdc_gwcs.solve.evidence import truncation
 from wpdc_gwcs.solve.exposure import ExposureFit
 from wpdc_gwcs.solve.geometry import mean_direction
 from wpdc_gwcs.solve.model import block, colored, undistorted
 from wpdc_gwcs.solve.state import predict_variance
+from wpdc_gwcs.solve.waves import count_places
 
 __all__ = ["N_SIGMA", "inherited", "represent_detector", "represent_frame", "split_linear"]
 
@@ -130,7 +132,9 @@ def _growth(o, state, k, x, y):
 
 
 def inherited(o, state, k):
-    """Return the factor for the errors of the distortion due to stars that exposures share.
+    """Return the factor for the errors of a distortion due to what its terms do not know.
+
+    These are errors of reference stars that exposures share, and degrees beyond the last one.
 
     Parameters
     ----------
@@ -143,7 +147,13 @@ def inherited(o, state, k):
     """
     behind = _behind(o, state, k)
     variance = np.mean(state.sigma[:, behind] ** 2, axis=0)
-    return np.sqrt(repetition(o.star[behind], variance, o.reference[behind]))
+    factor = np.sqrt(repetition(o.star[behind], variance, o.reference[behind]))
+    if "polynomial" in state.model.sigma:
+        detector = o.detectors[k]
+        side = max(detector.image_shape)
+        n_places = count_places(np.array([o.x[behind], o.y[behind]]) / side)
+        factor *= truncation(state.model.sigma["polynomial"], n_places)
+    return factor
 
 
 def _behind(o, state, k):

@@ -17,7 +17,7 @@ from numpy.polynomial.legendre import legvander
 from scipy.interpolate import CubicSpline
 from scipy.linalg import lapack
 
-__all__ = ["Waves", "candidates", "fit_waves"]
+__all__ = ["Waves", "candidates", "count_places", "fit_waves"]
 
 # Size of the patch of the waves, in units of the detector.  It makes the steps of the wave number
 # finer, because a wave of the sensor does not end at its edge.
@@ -38,8 +38,8 @@ _FREE_DEGREE = 5
 _PLACES_PER_TERM = 60
 _WEAK = 0.5
 
-# Stars closer to each other than this are at one place, in units of the shortest wave.
-_PLACE = 0.25
+# Stars closer to each other than this are at one place, in units of the longer side.
+_PLACE = 0.25 * _SHORTEST
 
 # Detectors have edge effects within some pixels.  A table represents them as far as its outermost
 # nodes can, so these are shapes as well, for a table with this many nodes.
@@ -205,6 +205,33 @@ def _finer(orders, strong):
     return np.unique(every[:, np.any(every != 0, axis=0)], axis=1)
 
 
+def count_places(positions):
+    """Count the places with stars on a detector.
+
+    Parameters
+    ----------
+    positions : (2, N) ndarray
+        Positions of stars in units of the longer side.
+
+    Returns
+    -------
+    float
+        Number of places: that of the stars, if they are not at the same places again and again.
+    """
+    if not positions.shape[1]:
+        return 0.0
+    cells = positions / _PLACE
+    low, high = np.floor(cells.min(1)), np.floor(cells.max(1)) + 1
+    total = float(np.prod(high - low))
+    number = np.floor(cells - low[:, None]).astype(int)
+    occupied = len(np.unique(number[0] * int(high[1] - low[1]) + number[1]))
+    # Stars far from each other share a cell by chance; if they fill all cells, there is no telling.
+    free = 1.0 - occupied / total
+    return float(
+        positions.shape[1] if free == 0 else min(positions.shape[1], -total * np.log(free))
+    )
+
+
 def fit_waves(low, high, focal, residual, variance):
     """Find the waves of a detector.
 
@@ -235,7 +262,7 @@ def fit_waves(low, high, focal, residual, variance):
     low, high = np.asarray(low, float), np.asarray(high, float)
     center, size = 0.5 * (low + high), high - low
     weight = np.mean(1.0 / variance, axis=0)
-    n_places = _count_places((focal - low[:, None]) / (_PLACE * _SHORTEST * size.max()))
+    n_places = count_places((focal - low[:, None]) / size.max())
     terms = np.cumsum(np.arange(_FREE_DEGREE + 1) + 1)
     if n_places < _PLACES_PER_TERM * terms[1]:
         return None
@@ -261,17 +288,6 @@ def fit_waves(low, high, focal, residual, variance):
     if power > _WEAK and n_places < _PLACES_PER_TERM * n_terms:
         return None
     return Waves(*shape, coefficients, taken, half.astype(np.float32))
-
-
-def _count_places(cells):
-    """Count the places with stars, from positions in units of the size of a place."""
-    low, high = np.floor(cells.min(1)), np.floor(cells.max(1)) + 1
-    total = float(np.prod(high - low))
-    number = np.floor(cells - low[:, None]).astype(int)
-    occupied = len(np.unique(number[0] * int(high[1] - low[1]) + number[1]))
-    # Stars far from each other share a cell by chance; if they fill all cells, there is no telling.
-    free = 1.0 - occupied / total
-    return cells.shape[1] if free == 0 else min(cells.shape[1], -total * np.log(free))
 
 
 def _learned(normal, right, told, n):
