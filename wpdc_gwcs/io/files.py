@@ -54,7 +54,23 @@ _UNFIT = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\udc80-\udcff]")
 
 
 class OutputExistsError(InputError, FileExistsError):
-    """An output file exists and may not be replaced."""
+    """An output file exists and may not be replaced.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs import write
+    >>> from wpdc_gwcs.io import OutputExistsError
+    >>> path = f"{tempfile.mkdtemp()}/stars.ecsv"
+    >>> write(Table({"x": [1.0]}), path)
+    >>> write(Table({"x": [2.0]}), path)
+    Traceback (most recent call last):
+        ...
+    wpdc_gwcs.io.files.OutputExistsError: ...stars.ecsv: file exists and is kept; ...
+    >>> issubclass(OutputExistsError, FileExistsError)
+    True
+    """
 
 
 def first_line(error):
@@ -488,6 +504,19 @@ def atomic_path(path, *, overwrite=False):
         If the file exists and may not be replaced, also when it appeared in the meantime.
     InputError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from wpdc_gwcs.io import atomic_path
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> with atomic_path(folder / "notes.txt") as temporary:
+    ...     size = temporary.write_text("all or nothing")
+    ...     print((folder / "notes.txt").exists())
+    False
+    >>> (folder / "notes.txt").read_text()
+    'all or nothing'
     """
     path = Path(path)
     check_output(path, overwrite=overwrite)
