@@ -33,6 +33,8 @@ html_title = f"wpdc_gwcs {release}"
 html_copy_source = False
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]
+# Pages without others below them need no navigation at their side.
+html_sidebars = {"tutorial/index": [], "changelog": []}
 html_theme_options = {
     "logo": {"text": "wpdc_gwcs"},
     "header_links_before_dropdown": 8,
@@ -64,6 +66,8 @@ def _write_math(translator, node, *, block):
         written = latex2mathml.tex2mathml(tex, as_block=block)
     except MathError as error:
         raise ExtensionError(f"{node.source}:{node.line}: {error}: {tex}") from error
+    # An apostrophe is no prime.
+    written = written.replace("<mo>'</mo>", '<mo lspace="0" rspace="0">\u2032</mo>')
     tag = "div" if block else "span"
     translator.body.append(f'<{tag} class="formula">{written}</{tag}>')
     raise SkipNode
