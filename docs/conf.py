@@ -26,6 +26,9 @@ html_math_renderer = "mathml"
 
 automodapi_inheritance_diagram = False
 automodapi_toctreedirnm = "reference/api"
+# For the template of classes in _templates/autosummary_core.
+automodsumm_properties_are_attributes = False
+templates_path = ["_templates"]
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = False
 
