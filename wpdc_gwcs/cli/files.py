@@ -9,10 +9,10 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.completion import one_of
 from wpdc_gwcs.cli.options import Overwrite
+from wpdc_gwcs.cli.positions import read_position, require_on_sphere
 from wpdc_gwcs.columns import listed, spelled_names
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
-from wpdc_gwcs.sexagesimal import read_angles
 
 CalibrationFile = Annotated[
     Path,
@@ -139,21 +139,7 @@ def _read_pixel(points):
 
 
 def _read_sky(points):
-    """Right ascension and declination in deg of the arguments, in any form and quoting."""
-    words = _two_words(points, ("ra", "dec"))
-    values = []
-    for name, form, word in zip(("ra", "dec"), ("12:34:56.7", "-01:02:03"), words):
-        try:
-            values.append(np.float64(word))
-        except ValueError:
-            (value,) = read_angles([word], hours=name == "ra")
-            if np.isnan(value):
-                raise InputError(
-                    f"{name} must be a number of deg, or an angle such as {form}, got {word!r}"
-                ) from None
-            values.append(value)
-    _require_on_sphere(("ra", "dec"), np.reshape(values, (2, 1)))
-    return values
+    return read_position(_two_words(points, ("ra", "dec")))
 
 
 def _two_words(points, names):
@@ -181,18 +167,6 @@ def _is_number(text):
     except ValueError:
         return False
     return True
-
-
-def _require_on_sphere(names, values, path=None):
-    for name, angle, limit in zip(names, values, (360.0, 90.0)):
-        wrong = np.flatnonzero(np.abs(angle) > limit)
-        if len(wrong):
-            what, where = name, ""
-            if path is not None:
-                what, where = f"{path}: column {name!r}", f" in row {wrong[0]}"
-            raise InputError(
-                f"{what} must lie in [-{limit:g}, {limit:g}] deg, got {angle[wrong[0]]:g}{where}"
-            )
 
 
 def _transform_table(path, names, transform, output, overwrite):
@@ -234,7 +208,7 @@ def _table_sky(table, path):
                 f"{row}"
             )
         values.append(found)
-    _require_on_sphere(pair, values, path)
+    require_on_sphere(pair, values, path=path)
     return values
 
 
