@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from astropy import units as u
 from numpy.testing import assert_allclose
 
-from wpdc_gwcs.solve.waves import candidates, fit_waves
+from wpdc_gwcs import calibrate, read_catalog, simulate
+from wpdc_gwcs.solve.waves import _count_places, candidates, fit_waves
 
 LOW, HIGH = np.array([-3000.0, 500.0]), np.array([1000.0, 4500.0])
 SIGMA = 0.03
@@ -42,7 +44,7 @@ def fitted(rng, truth, n, sigma=SIGMA):
     return waves, grid, without_polynomials(grid, waves(grid) - truth(grid))
 
 
-@pytest.mark.parametrize("n", [1000, 8000, 25_000])
+@pytest.mark.parametrize("n", [5000, 8000, 25_000])
 def test_few_waves_are_found(rng, n):
     truth = some_waves(rng)
     waves, grid, error = fitted(rng, truth, n)
@@ -51,7 +53,34 @@ def test_few_waves_are_found(rng, n):
     assert rms(error) < 0.25 * rms(truth(grid))
 
 
-@pytest.mark.parametrize("n", [150, 1000, 8000])
+def test_few_places_tell_no_waves(rng):
+    truth, variance = some_waves(rng), np.full((2, 6000), SIGMA**2)
+    spread = places(rng, 6000)
+    assert fit_waves(LOW, HIGH, spread, truth(spread), variance) is not None
+    # Twenty exposures that point within a few pixels of each other.
+    same = np.tile(places(rng, 300), 20) + rng.uniform(-10, 10, (2, 6000))
+    assert fit_waves(LOW, HIGH, same, truth(same), variance) is None
+    few = places(rng, 1000)
+    assert fit_waves(LOW, HIGH, few, truth(few), variance[:, :1000]) is None
+    # Waves that are a third of the errors may as well be there.
+    weak = rng.normal(size=few.shape) * 10 * SIGMA
+    assert fit_waves(LOW, HIGH, few, truth(few) + weak, 100 * variance[:, :1000]) is not None
+    two = places(rng, 2)
+    assert fit_waves(LOW, HIGH, two, truth(two), variance[:, :2]) is None
+
+
+@pytest.mark.parametrize("n", [20, 2000])
+def test_places_are_counted(rng, n):
+    spread = 40 * rng.uniform(size=(2, n))
+    assert_allclose(_count_places(spread), n, rtol=0.1)
+    assert_allclose(_count_places(np.tile(spread, 5)), _count_places(spread), rtol=0.1)
+
+
+def test_places_are_not_more_than_stars(rng):
+    assert _count_places(40 * rng.uniform(size=(2, 30_000))) == 30_000
+
+
+@pytest.mark.parametrize("n", [1000, 8000])
 def test_noise_stays_out(rng, n):
     waves, grid, _ = fitted(rng, lambda focal: np.zeros_like(focal), n)
     # A small part of what the 850 candidates would take of the noise.
@@ -62,7 +91,7 @@ def test_noise_stays_out(rng, n):
 def test_uncertainty_is_that_of_the_errors(rng):
     pulls = []
     for _ in range(4):
-        waves, grid, error = fitted(rng, some_waves(rng), 3000)
+        waves, grid, error = fitted(rng, some_waves(rng), 6000)
         covariance = waves.covariance(grid)
         assert_allclose(covariance[0, 1], 0.0)
         pulls.append(error / np.sqrt(covariance[[0, 1], [0, 1]]))
@@ -136,3 +165,20 @@ def test_rims_get_what_a_table_can_take(rng):
     # Where there is none, none is seen.
     none = fit_waves(LOW, HIGH, focal, waves(focal) + noise, np.full((2, n), SIGMA**2))
     assert np.abs(none.coefficients[:, -4:]).max() < 0.003
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_uncertainty_between_stars_of_exposures_that_point_alike(seed):
+    """Eight exposures within 20 px of each other, of stars 340 px apart, with waves of 0.3 px."""
+    size = 4096
+    simulation = simulate(
+        8, image_shape=(size, size), distortion=30, waves=0.3, density=6, seed=seed,
+        pixel_scale=0.074 * u.arcsec, dither=1.5 * u.arcsec,
+    )  # fmt: skip
+    frames = [exposure.frame() for exposure in simulation.exposures]
+    calibration = calibrate(frames, read_catalog(simulation.reference)).calibrations[0]
+    x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(0, size - 1, 21)]))
+    found = calibration.wcs.invert(*simulation.exposures[0].sky(x, y), with_bounding_box=False)
+    pulls = (np.array(found) - [x, y]) / calibration.uncertainty(x, y)[:2]
+    assert np.sqrt(np.mean(pulls**2)) < 1.3
+    assert np.abs(pulls).max() < 5

@@ -18,9 +18,6 @@ __all__ = ["with_fields", "with_spectra", "with_statics"]
 _MOST_MARGINAL, _MOST_FINAL = 250, 1000
 _STARS_PER_WAVE_MARGINAL, _STARS_PER_WAVE = 3, 4
 
-# Number of stars of a detector, from all exposures, that determine its waves.
-_LEAST_WAVES = 100
-
 # Number of steps of the grid on which waves are sampled: twice that of a table, so that the nodes
 # of the table, with the edge effects at the outermost ones, are grid points.
 _STEPS_WAVES = 98
@@ -196,9 +193,10 @@ def with_statics(o, state):
         places = [_places(o, plain, f) for f in frames]
         stars[k] = [np.concatenate(places, axis=1)]
         stars[k] += [np.concatenate([p[i] for p in parts], axis=1) for i in (1, 2)]
-        if stars[k][0].shape[1] >= _LEAST_WAVES:
-            box = _box(o, state, k, 0.0)
-            statics[k] = of_field(fit_waves(*box, *stars[k]), *box, least_steps=_STEPS_WAVES)
+        box = _box(o, state, k, 0.0)
+        waves = fit_waves(*box, *stars[k])
+        if waves is not None:
+            statics[k] = of_field(waves, *box, least_steps=_STEPS_WAVES)
             stars[k][1] = stars[k][1] - statics[k](stars[k][0])
     for k, field in _common_fields(o, state, stars).items():
         statics[k] = SummedField((statics[k], field)) if k in statics else field

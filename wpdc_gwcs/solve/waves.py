@@ -26,10 +26,20 @@ _OVERSIZE = 1.6
 # Shortest wave in units of the longer side.
 _SHORTEST = 0.1
 
-# Largest degree of the polynomials; of those that other terms have, and stars for each of these, if
-# they are to be fitted freely beside the waves: they have taken a part of them already.
+# Largest degree of the polynomials, and of those that other terms have and that are fitted freely
+# beside the waves, because they have taken a part of them already.
 _DEGREE = 9
-_FREE_DEGREE, _STARS_PER_TERM = 5, 40
+_FREE_DEGREE = 5
+
+# Places with stars for each coefficient that they determine, free polynomials included.  With
+# fewer, shapes that are right at the stars are wrong by many times their errors between them and in
+# the corners: a few shapes of many always fit few places.  Waves whose mean square is below this
+# part of that of the errors at a place do no harm.
+_PLACES_PER_TERM = 60
+_WEAK = 0.5
+
+# Stars closer to each other than this are at one place, in units of the shortest wave.
+_PLACE = 0.25
 
 # Detectors have edge effects within some pixels.  A table represents them as far as its outermost
 # nodes can, so these are shapes as well, for a table with this many nodes.
@@ -207,8 +217,9 @@ def fit_waves(low, high, focal, residual, variance):
 
     Returns
     -------
-    Waves
-        The waves, without polynomials of low degree.
+    Waves or None
+        The waves, without polynomials of low degree; `None` if there are too few places with stars
+        to tell them.
 
     Notes
     -----
@@ -224,27 +235,47 @@ def fit_waves(low, high, focal, residual, variance):
     low, high = np.asarray(low, float), np.asarray(high, float)
     center, size = 0.5 * (low + high), high - low
     weight = np.mean(1.0 / variance, axis=0)
+    n_places = _count_places((focal - low[:, None]) / (_PLACE * _SHORTEST * size.max()))
+    terms = np.cumsum(np.arange(_FREE_DEGREE + 1) + 1)
+    if n_places < _PLACES_PER_TERM * terms[1]:
+        return None
+    least_degree = int(np.searchsorted(terms, n_places / _PLACES_PER_TERM, side="right"))
     if focal.shape[1] > _MOST_STARS:
         side = _SHORTEST * size.max() / _CELLS_PER_WAVE
         focal, residual, weight = _averaged(focal, residual, weight, side)
     orders, step = candidates(low, high)
-    terms = np.cumsum(np.arange(_FREE_DEGREE + 1) + 1)
-    least_degree = max(np.count_nonzero(terms * _STARS_PER_TERM <= focal.shape[1]), 2)
     for zoom in range(_ZOOMS + 1):
         shape = center, size, orders, step, least_degree
         normal, right, taken, told = _normal_equations(shape, focal, residual, weight)
         root, known = _learned(normal, right, told, orders.shape[1])
-        seen = np.flatnonzero(known > _SEEN)
+        seen = np.flatnonzero(known[: orders.shape[1]] > _SEEN)
         if zoom == _ZOOMS or not seen.size:
             break
         strong = seen[np.argsort(-root[seen], kind="stable")[:_MOST_ZOOMED]]
         orders, step = _finer(orders[:, seen], orders[:, strong]), 0.5 * step
     half = lapack.dtrtrs(_factor(normal, root), np.diag(root), lower=1)[0]
-    return Waves(*shape, (half.T @ (half @ right)).T, taken, half.astype(np.float32))
+    coefficients = (half.T @ (half @ right)).T
+    # Mean square of both axes over that of the errors at each place.
+    power = np.sum(coefficients * (coefficients @ normal)) / (2 * n_places)
+    n_terms = terms[least_degree - 1] + 0.5 * known.sum()
+    if power > _WEAK and n_places < _PLACES_PER_TERM * n_terms:
+        return None
+    return Waves(*shape, coefficients, taken, half.astype(np.float32))
+
+
+def _count_places(cells):
+    """Count the places with stars, from positions in units of the size of a place."""
+    low, high = np.floor(cells.min(1)), np.floor(cells.max(1)) + 1
+    total = float(np.prod(high - low))
+    number = np.floor(cells - low[:, None]).astype(int)
+    occupied = len(np.unique(number[0] * int(high[1] - low[1]) + number[1]))
+    # Stars far from each other share a cell by chance; if they fill all cells, there is no telling.
+    free = 1.0 - occupied / total
+    return cells.shape[1] if free == 0 else min(cells.shape[1], -total * np.log(free))
 
 
 def _learned(normal, right, told, n):
-    """Prior standard deviation of each coefficient, and how many of each wave are determined."""
+    """Prior standard deviation of each coefficient, and how many of each shape are determined."""
     own = np.arange(n, len(normal) - n)
     # A detector with an edge effect has it at all its edges.
     group = np.concatenate([np.arange(n), np.arange(n), np.minimum(own, own[-_RIMS])])
@@ -259,7 +290,7 @@ def _learned(normal, right, told, n):
         square = np.bincount(group, np.sum((root[:, None] * scaled) ** 2, axis=1))
         known = np.bincount(group, 2 * (1.0 - np.diagonal(inverse)))
         power = (_GUESS_WEIGHT * least + square) / (_GUESS_WEIGHT + known)
-    return np.sqrt(power)[group], known[:n]
+    return np.sqrt(power)[group], known
 
 
 def _factor(normal, root):
