@@ -189,6 +189,21 @@ def test_refusals(folder, capsys):
     assert image.read_bytes() == before
 
 
+def test_an_image_with_its_errors(tmp_path, exposures, capsys):
+    """They are images too, and have the same shape."""
+    one, image = exposures["a"]["N1"], tmp_path / "a.fits"
+    data = np.zeros(one.solution.image_shape, np.float32)
+    hdus = [fits.ImageHDU(data, header_of(one), name=name) for name in ("SCI", "ERR", "DQ")]
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(image)
+    write(one, tmp_path / "a.wcs.asdf")
+    for given in (tmp_path / "a.wcs.asdf", tmp_path):
+        line = refusal(capsys, "export", given, "--into", image)
+        assert "has 3 images of two axes, of which one is a frame; choose it with path[EXT]" in line
+    run_well(capsys, "export", tmp_path / "a.wcs.asdf", "--into", f"{image}[SCI]")
+    kinds = [fits.getheader(image, name)["CTYPE1"] for name in ("SCI", "ERR", "DQ")]
+    assert kinds == ["RA---TPV", "RA---TAN", "RA---TAN"]
+
+
 def test_calibrations_of_others_are_refused(tmp_path, exposures):
     image = tmp_path / "a.fits"
     write_image(image, exposures["a"])

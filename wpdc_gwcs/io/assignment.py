@@ -9,7 +9,9 @@ from astropy.coordinates import SkyCoord
 from wpdc_gwcs.columns import listed
 from wpdc_gwcs.exceptions import InputError, WPDCWarning
 from wpdc_gwcs.io.embed import image_numbers
+from wpdc_gwcs.io.files import open_fits
 from wpdc_gwcs.io.frames import read_frames
+from wpdc_gwcs.io.headers import extension_names
 
 __all__ = ["assign_extensions", "frames_of_image"]
 
@@ -45,12 +47,17 @@ def frames_of_image(image):
         # They are about the use of a header for a match.
         warnings.simplefilter("ignore", WPDCWarning)
         frames = read_frames(image)
-    if len(frames) == 1 and len(numbers := image_numbers(image)) == 1:
-        return {numbers[0]: frames[0]}
-    numbers = [_NUMBER.search(frame.source) for frame in frames]
-    if not all(numbers):
-        raise InputError(f"{image}: choose one of its images with IMAGE[EXT]: only one is a frame")
-    return {int(found[1]): frame for found, frame in zip(numbers, frames, strict=True)}
+    if len(frames) > 1:
+        return {int(_NUMBER.search(frame.source)[1]): frame for frame in frames}
+    numbers = image_numbers(image)
+    if len(numbers) > 1:
+        with open_fits(image, lazy=True) as hdus:
+            names = extension_names(hdus)
+        raise InputError(
+            f"{image}: has {len(numbers)} images of two axes, of which one is a frame; choose it "
+            f"with path[EXT], EXT one of {names}"
+        )
+    return dict(zip(numbers, frames, strict=True))
 
 
 def assign_extensions(image, frames, calibrations):
