@@ -3,7 +3,7 @@
 from functools import partial
 from importlib.metadata import version as _version
 
-from docutils.nodes import SkipNode
+from docutils.nodes import SkipNode, literal_block
 from docutils.utils.math import MathError, latex2mathml
 from sphinx.errors import ExtensionError
 from sphinx_astropy.conf.v2 import *  # noqa: F403
@@ -76,7 +76,15 @@ def _write_math(translator, node, *, block):
     raise SkipNode
 
 
+def _leave_plain(app, doctree):
+    """Show commands and diagrams without the colors of Python."""
+    for node in doctree.findall(literal_block):
+        if "language" not in node and not node.astext().startswith(">>>"):
+            node["language"] = "text"
+
+
 def setup(app):
     """Let browsers draw the formulas by themselves: MathML instead of a script from elsewhere."""
+    app.connect("doctree-read", _leave_plain)
     inline, block = (partial(_write_math, block=b) for b in (False, True))
     app.add_html_math_renderer("mathml", (inline, None), (block, None))
