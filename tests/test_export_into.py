@@ -224,6 +224,15 @@ def test_calibrations_of_others_are_refused(tmp_path, exposures):
             assign_extensions(image, frames, {"f": wrong})
 
 
+def test_of_many_frames_some_are_named(tmp_path, exposures):
+    names = [f"D{k}" for k in range(20)]
+    image, one = tmp_path / "a.fits", exposures["a"]["N1"]
+    write_image(image, dict.fromkeys(names, one))
+    alien = dataclasses.replace(one, solution=dataclasses.replace(one.solution, detector="X"))
+    with pytest.raises(InputError, match=r"a_D11, \.\.\. \(20 frames\) and detectors D0, "):
+        assign_extensions(image, frames_of_image(image), {"f": alien})
+
+
 def test_a_solution_goes_by_its_detector(tmp_path, exposures):
     image = tmp_path / "a.fits"
     write_image(image, exposures["a"])

@@ -203,7 +203,7 @@ def _calibrations_of(files, image):
     owners = assign_extensions(image, frames, calibrations)
     left = [frames[number].name for number in sorted(set(frames) - set(owners))]
     if left:
-        log.warning("%s: no WCS for %s: left as it was", image, listed(left))
+        log.warning("%s: no WCS for %s: left as it was", image, listed(left, kind="frames"))
     return {number: calibrations[file] for number, file in owners.items()}, owners
 
 

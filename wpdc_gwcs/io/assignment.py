@@ -95,8 +95,9 @@ def assign_extensions(image, frames, calibrations):
         if number is None:
             raise InputError(
                 f"{name}: is of frame {getattr(one, 'frame', None)} and detector "
-                f"{solution.detector}; {image} has frames {listed(list(by_frame))} and detectors "
-                f"{listed(list(by_detector))}"
+                f"{solution.detector}; {image} has frames "
+                f"{listed(list(by_frame), kind='frames')} and detectors "
+                f"{listed(list(by_detector), kind='detectors')}"
             )
         if number in found:
             raise InputError(

@@ -9,6 +9,7 @@ import numpy as np
 from astropy.table import Table
 
 from wpdc_gwcs.catalogs import read_table_file
+from wpdc_gwcs.columns import listed
 from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.files import READ_ERRORS, as_utf8, atomic_path, file_kind, first_line
 
@@ -114,7 +115,7 @@ def read_table(path, *, columns=()):
     for column in columns:
         if column not in table.colnames:
             raise FileFormatError(
-                f"{path}: table must have a column {column!r}, has {', '.join(table.colnames[:12])}"
+                f"{path}: table must have a column {column!r}, has {listed(table.colnames)}"
             )
         if table[column].dtype.kind not in "biuf":
             raise FileFormatError(
