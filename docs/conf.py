@@ -3,7 +3,7 @@
 from functools import partial
 from importlib.metadata import version as _version
 
-from docutils.nodes import SkipNode
+from docutils.nodes import SkipNode, literal_block
 from docutils.utils.math import MathError, latex2mathml
 from sphinx.errors import ExtensionError
 from sphinx_astropy.conf.v2 import *  # noqa: F403
@@ -26,6 +26,9 @@ html_math_renderer = "mathml"
 
 automodapi_inheritance_diagram = False
 automodapi_toctreedirnm = "reference/api"
+# For the template of classes in _templates/autosummary_core.
+automodsumm_properties_are_attributes = False
+templates_path = ["_templates"]
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = False
 
@@ -33,6 +36,8 @@ html_title = f"wpdc_gwcs {release}"
 html_copy_source = False
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]
+# Pages without others below them need no navigation at their side.
+html_sidebars = {"tutorial/index": [], "changelog": []}
 html_theme_options = {
     "logo": {"text": "wpdc_gwcs"},
     "header_links_before_dropdown": 8,
@@ -64,12 +69,22 @@ def _write_math(translator, node, *, block):
         written = latex2mathml.tex2mathml(tex, as_block=block)
     except MathError as error:
         raise ExtensionError(f"{node.source}:{node.line}: {error}: {tex}") from error
+    # An apostrophe is no prime.
+    written = written.replace("<mo>'</mo>", '<mo lspace="0" rspace="0">\u2032</mo>')
     tag = "div" if block else "span"
     translator.body.append(f'<{tag} class="formula">{written}</{tag}>')
     raise SkipNode
 
 
+def _leave_plain(app, doctree):
+    """Show commands and diagrams without the colors of Python."""
+    for node in doctree.findall(literal_block):
+        if "language" not in node and not node.astext().startswith(">>>"):
+            node["language"] = "text"
+
+
 def setup(app):
     """Let browsers draw the formulas by themselves: MathML instead of a script from elsewhere."""
+    app.connect("doctree-read", _leave_plain)
     inline, block = (partial(_write_math, block=b) for b in (False, True))
     app.add_html_math_renderer("mathml", (inline, None), (block, None))

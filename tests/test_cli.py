@@ -13,10 +13,10 @@ from astropy import units as u
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.stats import mad_std
-from astropy.table import Table
+from astropy.table import QTable, Table
 from astropy.wcs import WCS
 
-from wpdc_gwcs import read, read_catalog, read_frames
+from wpdc_gwcs import DistortionSolution, PVPolynomial, read, read_catalog, read_frames, write
 from wpdc_gwcs.catalogs import propagate
 from wpdc_gwcs.cli.app import run
 from wpdc_gwcs.simulation import simulate, write_simulation
@@ -287,9 +287,93 @@ def test_transform_of_a_table(results, tmp_path, capsys):
     assert "file exists" in error_of(capsys) or "exists" in error_of(capsys)
 
 
+def forms_of(position):
+    """Ways to write a position on the command line."""
+    colons = position.to_string("hmsdms", sep=":", precision=9)
+    units = position.to_string("hmsdms", precision=9)
+    decimals = f"{position.ra.deg:.12f} {position.dec.deg:.12f}"
+    degrees = position.ra.to_string("deg", precision=9), position.dec.to_string("deg", precision=9)
+    for text in (colons, units, decimals):
+        yield text.split()
+        yield [text]
+        yield text.replace(" ", ", ").split(" ")
+    yield colons.replace(":", " ").split()
+    yield [part.replace(":", " ") for part in colons.split()]
+    yield list(degrees)
+    yield f"{position.ra.hour:.12f}h {position.dec.deg:.12f}d".split()
+
+
+def test_sky2pix_reads_positions_in_any_form(results, capsys):
+    path = str(results / "sim-01.wcs.asdf")
+    sky = SkyCoord(*read(path).wcs(100.25, 200.5), unit="deg")
+    for form in forms_of(sky):
+        assert run(["sky2pix", path, *form]) == 0, form
+        found = [float(v) for v in capsys.readouterr().out.split()]
+        np.testing.assert_allclose(found, [100.25, 200.5], atol=2e-5)
+
+
+def test_sky2pix_reads_minus_zero(tmp_path, capsys):
+    cd = np.diag([-1e-3, 1e-3])
+    solution = DistortionSolution(
+        "d", (100, 100), np.array([49.5, 49.5]), cd, np.array([0.0, 0.0]), PVPolynomial()
+    )
+    write(solution, tmp_path / "d.solution.asdf")
+    assert run(["sky2pix", str(tmp_path / "d.solution.asdf"), "00:00:00", "-00:00:36"]) == 0
+    assert capsys.readouterr().out.split() == ["49.50000", "39.50000"]
+
+
+@pytest.mark.parametrize("names", [("ra", "dec"), ("RAJ2000", "DEJ2000"), ("Alpha", "Delta")])
+def test_sky2pix_reads_tables_of_any_angles(results, tmp_path, capsys, names):
+    path = str(results / "sim-01.wcs.asdf")
+    sky = SkyCoord(*read(path).wcs([10.0, 500.0, 900.0], [20.0, 600.0, 40.0]), unit="deg")
+    hours = sky.ra.to_string("hour", sep=":", precision=9)
+    degrees = sky.dec.to_string("deg", sep=":", precision=9)
+    for ra, dec in (
+        (hours, degrees),
+        ([h.replace(":", " ") for h in hours], [d.replace(":", " ") for d in degrees]),
+        (sky.ra.to_string("hour", precision=9), sky.dec.to_string("deg", precision=9)),
+        (sky.ra.to_string("deg", precision=9), sky.dec.deg),
+        (sky.ra.hour * u.hourangle, sky.dec.rad * u.rad),
+    ):
+        table = QTable([ra, dec], names=names)
+        table.write(tmp_path / "points.ecsv", overwrite=True)
+        assert run(["sky2pix", path, str(tmp_path / "points.ecsv")]) == 0
+        found = Table.read(capsys.readouterr().out, format="ascii.ecsv")
+        np.testing.assert_allclose(found["x"], [10.0, 500.0, 900.0], atol=1e-5)
+        np.testing.assert_allclose(found["y"], [20.0, 600.0, 40.0], atol=1e-5)
+
+
+def test_missing_positions_of_a_table_give_nan(results, tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("name,ra,dec\na,08:00:00,+30:00:00\nb,,\n")
+    assert run(["sky2pix", str(results / "sim-01.wcs.asdf"), str(tmp_path / "a.csv")]) == 0
+    found = Table.read(capsys.readouterr().out, format="ascii.ecsv")
+    assert np.isfinite(found["x"]).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("ra,dec\n08:00:00,+30:00:00\nx,y\n", "column 'ra' must hold angles, got 'x' in row 1"),
+        ("ra,dec\n08:00:00,95:00:00\n", "column 'dec' must lie in [-90, 90] deg, got 95 in row 0"),
+        ("ra,dec\nnorth,south\n", "column 'ra' must be numeric, got 'north'"),
+        ("x,y\n1,2\n", "table must have columns 'ra' and 'dec', has x, y"),
+    ],
+)
+def test_sky2pix_refuses_tables_in_one_line(results, tmp_path, capsys, rows, message):
+    (tmp_path / "a.csv").write_text(rows)
+    assert run(["sky2pix", str(results / "sim-01.wcs.asdf"), str(tmp_path / "a.csv")]) == 2
+    assert message in error_of(capsys)
+
+
 @pytest.mark.parametrize(
     ("arguments", "status", "message"),
     [
+        (["sky2pix", "{file}", "12:34:56", "south"], 2, "an angle such as -01:02:03, got 'south'"),
+        (["sky2pix", "{file}", "12:60:00", "1:2:3"], 2, "such as 12:34:56.7, got '12:60:00'"),
+        (["sky2pix", "{file}", "25:00:00", "1:2:3"], 2, "ra must lie in [-360, 360] deg, got 375"),
+        (["sky2pix", "{file}", "10", "-91"], 2, "dec must lie in [-90, 90] deg, got -91"),
+        (["sky2pix", "{file}", "12:34:56"], 2, "12:34:56: no such file; give ra and dec, or one"),
+        (["sky2pix", "{file}", "12:34:56", "1:2:3"], 1, "outside the sky of the detector"),
         (["pix2sky", "{file}", "-100", "5"], 1, "outside the detector"),
         (["sky2pix", "{file}", "300.0", "-60.0"], 1, "outside the sky of the detector"),
         (["pix2sky", "{file}", "1", "2", "3"], 2, "got 3 values"),
@@ -360,7 +444,7 @@ def test_export_of_several_files_into_a_folder(results, tmp_path, capsys):
         assert run(["export", *map(str, given), "--format", "head", "--output", str(output)]) == 2
         assert message in error_of(capsys)
     assert run(["export", str(results), "--into", "a.fits"]) == 2
-    assert f"--into takes one FILE, got {len(names)}" in error_of(capsys)
+    assert "a.fits: must be a readable file" in error_of(capsys)
 
 
 def test_matches_have_the_sky_with_errors(results):

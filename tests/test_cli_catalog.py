@@ -71,9 +71,11 @@ def test_a_box_across_right_ascension_zero(tmp_path, two):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--cone", "1,2"], "--cone must be 3 numbers"),
-        (["--cone", "1,2,x"], "--cone must be 3 numbers"),
-        (["--cone", "1,99,1"], "--cone: a cone needs"),
+        (["--cone", "1,2"], "--cone must be RA,DEC,RADIUS, got '1,2'"),
+        (["--cone", "1,2,x"], "the radius of --cone must be a number, got 'x'"),
+        (["--cone", "1,2,-1"], "--cone: a cone needs"),
+        (["--cone", "1,99,1"], "--cone: dec must lie in [-90, 90] deg, got 99"),
+        (["--cone", "east,1,1"], "--cone: ra must be a number of deg, or an angle such as 12:3"),
         (["--box", "1,2,5,4"], "--box: a box needs"),
         (["--box", "1,2,3,4", "--cone", "1,2,3"], "only one of"),
         (["--cone", "100,50,0.1"], "no stars are left"),

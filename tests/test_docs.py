@@ -116,6 +116,28 @@ def test_every_public_name_is_in_the_api_page():
             assert re.search(rf"`~wpdc_gwcs\.[\w.]+\.{name}`", page), name
 
 
+def public_objects():
+    """Functions and classes of the modules of the API page, by name."""
+    for module in re.findall(r"automodapi:: ([\w.]+)", read_page("reference/api.rst")):
+        loaded = importlib.import_module(module)
+        for name in loaded.__all__:
+            found = getattr(loaded, name)
+            if inspect.isclass(found) or inspect.isfunction(found):
+                yield f"{module}.{name}", found
+
+
+def test_every_public_function_and_class_has_an_example_that_runs():
+    def has_example(found):
+        lines = [line for line in inspect.getdoc(found).splitlines() if ">>>" in line]
+        return any("import" not in line and "+SKIP" not in line for line in lines)
+
+    objects = dict(public_objects())
+    assert len(objects) > 150
+    # A HATS catalog is a folder of Parquet files, which are made with an optional package.
+    without = [name for name, found in objects.items() if not has_example(found)]
+    assert without == ["wpdc_gwcs.catalogs.HatsCatalog"]
+
+
 @pytest.fixture(scope="module")
 def run():
     simulation = wpdc_gwcs.simulate(1, image_shape=(512, 512), density=100.0, distortion=5.0)

@@ -62,6 +62,43 @@ def test_kinds(tmp_path, image, compress):
             file_kind(path)
 
 
+@pytest.mark.parametrize(
+    ("start", "what"),
+    [
+        (b"\xff\xd8\xff\xe0\x00\x10JFIF", "a JPEG picture"),
+        (b"\x89PNG\r\n\x1a\n", "a PNG picture"),
+        (b"II*\0\x08\0\0\0", "a TIFF or raw picture"),
+        (b"PK\x03\x04\x14", "a ZIP archive"),
+        (b"%PDF-1.7\n", "a PDF"),
+        (b"\x93NUMPY\x01\0v\0", "another binary file"),
+        (b"\x7fELF\x02\x01", "another binary file"),
+    ],
+)
+@pytest.mark.parametrize("name", ["a.dat", "a.fits"])
+@pytest.mark.parametrize("compress", [gzip.compress, bytes])
+def test_a_file_of_another_kind_is_called_what_it_is(tmp_path, start, what, name, compress):
+    path = tmp_path / name
+    path.write_bytes(compress(start + bytes(500)))
+    with pytest.raises(FileFormatError, match=f"must be FITS, ASDF or a table, is {what}"):
+        file_kind(path)
+
+
+def test_noise_is_no_text(tmp_path):
+    (tmp_path / "a.dat").write_bytes(b"Data that go on " + bytes(range(1, 256)))
+    with pytest.raises(FileFormatError, match="is another binary file"):
+        file_kind(tmp_path / "a.dat")
+
+
+@pytest.mark.parametrize(
+    "start",
+    [b"\x89HDF\r\n\x1a\n\0", b"PAR1\x15\x04", "x y".encode("utf-16"), b"\xef\xbb\xbfx y\n"]
+    + ["étoiles\n".encode("latin-1"), b"CTYPE1  = 'RA---TAN'\0\0\0", b"\tx\ty\r\n"],
+)
+def test_tables_and_text_of_any_kind_are_read_on(tmp_path, start):
+    (tmp_path / "a.dat").write_bytes(start)
+    assert file_kind(tmp_path / "a.dat") == "text"
+
+
 def test_a_header_alone_is_text(tmp_path):
     header = "SIMPLE  =                    T".ljust(80) + "END".ljust(80)
     (tmp_path / "a.hdr").write_text(header)

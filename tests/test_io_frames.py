@@ -820,6 +820,9 @@ class TestBadInput:
 
     def test_garbage(self, tmp_path, wcs_file):
         (tmp_path / "s.ecsv").write_bytes(bytes(range(1, 256)) * 9)
+        with pytest.raises(FrameError, match="s.ecsv: must be FITS, ASDF or a table, is another"):
+            read_frames(tmp_path / "s.ecsv", wcs=wcs_file)
+        (tmp_path / "s.ecsv").write_bytes(b"# %ECSV 1.0\n# ---\n" * 9 + bytes(range(1, 256)))
         with pytest.raises(FrameError, match="s.ecsv: neither FITS nor a readable table"):
             read_frames(tmp_path / "s.ecsv", wcs=wcs_file)
 

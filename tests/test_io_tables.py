@@ -113,7 +113,7 @@ def test_other_formats(tmp_path, suffix):
         (b"", "must not be empty"),
         (b"# %ECSV 1.0\n# ---\n# datatype:\n# - {name: a", "not a readable table"),
         (b"x y\n1 2\n3\n", "not a readable table"),
-        (bytes(range(256)), "not a readable table"),
+        (bytes(range(256)), "must be FITS, ASDF or a table, is another binary file"),
     ],
 )
 def test_bad_tables(tmp_path, content, message):

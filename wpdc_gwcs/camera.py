@@ -134,6 +134,21 @@ def build_camera(name, exposures, solutions, *, provenance=None):
     Camera
         Camera with the mean places over the exposures; detectors that are not connected to the
         others by exposures, even indirectly, are left out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import Calibration, DistortionSolution, PVPolynomial
+    >>> from wpdc_gwcs.camera import build_camera
+    >>> cd, pv, center = np.diag([-1e-4, 1e-4]), PVPolynomial(), np.array([499.5, 499.5])
+    >>> solutions, frames = {}, []
+    >>> for name, ra in (("a", 10.0), ("b", 9.89)):  # the second one 0.11 deg to the west
+    ...     sky = np.array([ra, 0.0])
+    ...     solutions[name] = DistortionSolution(name, (1000, 1000), center, cd, sky, pv)
+    ...     frames.append(Calibration(name, solutions[name], crval=sky, cd=cd))
+    >>> camera = build_camera("pair", [frames], solutions)
+    >>> camera.places.round(2).tolist()
+    [[0.0, 0.0], [1100.0, 0.0]]
     """
     by_detector = [{c.solution.detector: c for c in frames} for frames in exposures]
     names = [n for n in solutions if any(n in frames for frames in by_detector)]

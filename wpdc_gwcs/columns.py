@@ -61,15 +61,17 @@ def find_name(spelled, aliases):
     return next((spelled[a] for a in aliases if a in spelled), None)
 
 
-def listed(names, most=12):
-    """List the names of columns for a message.
+def listed(names, most=12, *, kind="columns"):
+    """List the names of columns, or of other things, for a message.
 
     Parameters
     ----------
     names : sequence of str
-        Names of columns.
+        The names.
     most : int, optional
         Maximum number shown.
+    kind : str, optional
+        What they are, in the plural.
 
     Returns
     -------
@@ -77,7 +79,7 @@ def listed(names, most=12):
         Names separated by commas.
     """
     shown = ", ".join(names[:most])
-    return f"{shown}, ... ({len(names)} columns)" if len(names) > most else shown
+    return f"{shown}, ... ({len(names)} {kind})" if len(names) > most else shown
 
 
 def read_text(column):

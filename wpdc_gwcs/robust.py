@@ -51,6 +51,15 @@ def robust_sigma(values):
     -------
     float
         Scatter in the unit of the values; NaN if there are none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.fitting import robust_sigma
+    >>> values = np.random.default_rng(1).normal(0, 2, 10000)
+    >>> values[:100] = 1e6
+    >>> round(robust_sigma(values), 1)
+    2.0
     """
     return _MAD_TO_SIGMA * float(np.median(np.abs(values))) if len(values) else np.nan
 

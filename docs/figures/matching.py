@@ -23,7 +23,7 @@ from wpdc_gwcs.catalogs import propagate, read_catalog
 from wpdc_gwcs.io import read_frames
 from wpdc_gwcs.matching import MatchOptions, match_planes, pair_nearest, select_sources
 from wpdc_gwcs.matching._features import (
-    N_NEIGHBOURS,
+    N_NEIGHBORS,
     density_ratio_map,
     neighbor_pattern,
 )
@@ -75,9 +75,9 @@ class Stages:
         )
         self.sources = Stars.build(self.problem.sources)
         self.reference = self.problem.stars
-        self.n_near = count_neighbors(self.problem, self.sources, self.reference, N_NEIGHBOURS)
+        self.n_near = count_neighbors(self.problem, self.sources, self.reference, N_NEIGHBORS)
         self.hypotheses, self.groups = find_groups(
-            self.problem, self.sources, self.reference, None, N_ANCHORS, N_NEIGHBOURS, 10**8
+            self.problem, self.sources, self.reference, None, N_ANCHORS, N_NEIGHBORS, 10**8
         )
 
     def is_right(self, i, j):

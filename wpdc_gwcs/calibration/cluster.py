@@ -51,6 +51,15 @@ def cluster_executor(address, timeout):
     ClusterError
         If Dask is not installed, no scheduler answers, or there is no worker for so long.  Later on
         it is raised by the futures.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.calibration import cluster_executor
+    >>> with cluster_executor("tcp://127.0.0.1:9", timeout=0.1):  # no scheduler there
+    ...     pass
+    Traceback (most recent call last):
+        ...
+    wpdc_gwcs.exceptions.ClusterError: ...
     """
     try:
         from dask.distributed import Client

@@ -80,6 +80,16 @@ def measure_sources(frame, settings=None):
     -----
     Fainter stars than ``min_snr`` are measured with the others, whose light they disturb, and left
     out at the end.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import simulate
+    >>> from wpdc_gwcs.calibration import Settings, measure_sources
+    >>> sky = simulate(1, image_shape=(256, 256), density=60, distortion=3, seed=1)
+    >>> image = sky.exposures[0].frame(image=True)
+    >>> sources = measure_sources(image, Settings(centroids="windowed"))
+    >>> len(sources), round(sources.meta["fwhm"], 1)
+    (70, 2.8)
     """
     settings = Settings() if settings is None else settings
     if frame.load_sources is not None:

@@ -86,6 +86,21 @@ def start_from_neighbors(frames, results, catalog, settings=None, *, solution=No
     -----
     Only frames with a camera and an exposure are used.  A frame that is still not matched keeps
     the reason that it had.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import read_catalog, simulate
+    >>> from wpdc_gwcs.calibration import match_frame, start_from_neighbors
+    >>> from wpdc_gwcs.calibration.matched import FailedFrame
+    >>> from wpdc_gwcs.exceptions import MatchError
+    >>> sky = simulate(1, camera="bass-90prime", detectors=["CCD1", "CCD2"],
+    ...                image_shape=(512, 512), density=30, distortion=12, seed=2)
+    >>> catalog = read_catalog(sky.reference)
+    >>> one, two = [exposure.frame() for exposure in sky.exposures]
+    >>> alone = {one.name: match_frame(one, catalog), two.name: FailedFrame(MatchError(), 0, 0.0)}
+    >>> together = start_from_neighbors([one, two], alone, catalog)
+    >>> [type(result).__name__ for result in together.values()]
+    ['MatchedFrame', 'FailedFrame']
     """
     settings = Settings() if settings is None else settings
     results = dict(results)

@@ -85,6 +85,18 @@ class CalibrationRun:
         Identifier of the run, which is in all its files.
     resumed : tuple of str
         Frames of an earlier run whose results were read from its files.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import calibrate, simulate
+    >>> sky = simulate(1, image_shape=(512, 512), density=60, distortion=3, seed=1)
+    >>> run = calibrate([sky.exposures[0].frame()], sky.reference)
+    >>> run.calibrations[0].frame, list(run.solutions), run.failures
+    ('sim-01', ['sim'], {})
+    >>> print(run.summary["frame", "status", "n_sources", "n_matched"])
+    frame  status n_sources n_matched
+    ------ ------ --------- ---------
+    sim-01 solved       387       349
     """
 
     calibrations: tuple

@@ -102,6 +102,15 @@ def split_extension(path):
         The file.
     extension : int, str or None
         Number or name of the extension.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.catalogs import split_extension
+    >>> path, extension = split_extension("night1/a.fits[SCI]")
+    >>> path.name, extension
+    ('a.fits', 'SCI')
+    >>> split_extension("a.fits[2]")[1], split_extension("a.fits")[1]
+    (2, None)
     """
     text = str(path)
     found = re.fullmatch(r"(.+)\[([^\[\]]+)\]", text)
@@ -123,6 +132,13 @@ def special_file(path):
     -------
     what : str or None
         For messages, such as ``a folder`` or ``a pipe``; `None` for a file or a missing path.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from wpdc_gwcs.catalogs import special_file
+    >>> special_file(tempfile.mkdtemp()), special_file("no-such-file.fits")
+    ('a folder', None)
     """
     try:
         mode = os.stat(path).st_mode
@@ -150,6 +166,17 @@ def is_fits(path):
     -------
     bool
         True if its first bytes are those of FITS.
+
+    Examples
+    --------
+    >>> import gzip
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from wpdc_gwcs.catalogs import is_fits
+    >>> path = Path(tempfile.mkdtemp()) / "stars.dat"
+    >>> size = path.write_bytes(gzip.compress(b"SIMPLE  =                    T" + 50 * b" "))
+    >>> is_fits(path)
+    True
     """
     with open_any(path) as file:
         return file.read(9) == b"SIMPLE  ="
@@ -191,7 +218,7 @@ def choose_table(hdus, path, extension=None):
 
 
 def read_table_file(path, format=None):
-    """Read a table that is not FITS.
+    r"""Read a table that is not FITS.
 
     Parameters
     ----------
@@ -210,6 +237,16 @@ def read_table_file(path, format=None):
     ------
     one of READ_ERRORS
         If the file cannot be read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from wpdc_gwcs.catalogs import read_table_file
+    >>> path = Path(tempfile.mkdtemp()) / "stars.csv"
+    >>> size = path.write_text("ra,dec,pmra\n10,20,1.5\n11,21,null\n")
+    >>> read_table_file(path)["pmra"].tolist()
+    [1.5, None]
     """
     # Absolute, because astropy expands a leading '~'.
     path = Path(path).absolute()
@@ -239,7 +276,7 @@ def read_table_file(path, format=None):
 
 
 def read_lines(path):
-    """Read the lines of a text file.
+    r"""Read the lines of a text file.
 
     Parameters
     ----------
@@ -255,6 +292,17 @@ def read_lines(path):
     ------
     one of READ_ERRORS
         If the file cannot be read or is not text.
+
+    Examples
+    --------
+    >>> import gzip
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from wpdc_gwcs.catalogs import read_lines
+    >>> path = Path(tempfile.mkdtemp()) / "stars.txt.gz"
+    >>> size = path.write_bytes(gzip.compress("# M\xfcnchen\nra dec\n".encode("latin-1")))
+    >>> read_lines(path)
+    ['# München', 'ra dec']
     """
     with open_any(path) as file:
         return decode(file.read()).splitlines()

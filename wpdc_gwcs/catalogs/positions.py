@@ -1,18 +1,32 @@
 """Positions of a catalog: columns, units, impossible values, old reference systems."""
 
 import logging
-import re
 import warnings
 
 import numpy as np
 from astropy import units as u
-from astropy.coordinates import Angle, SkyCoord
+from astropy.coordinates import SkyCoord
 
-from wpdc_gwcs.columns import convert, read_numbers, read_text, spelled_names, unit_of
+from wpdc_gwcs.columns import (
+    MISSING,
+    convert,
+    read_numbers,
+    read_text,
+    spelled_names,
+    unit_of,
+)
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
+from wpdc_gwcs.sexagesimal import read_angles
 
-__all__ = ["POSITION_NAMES", "find_positions", "plain_degrees", "read_positions", "turn_to_icrs"]
+__all__ = [
+    "POSITION_NAMES",
+    "column_angles",
+    "find_positions",
+    "plain_degrees",
+    "read_positions",
+    "turn_to_icrs",
+]
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +67,6 @@ _MOST_WRONG = 0.5
 _SINGLE = np.finfo(np.float32).eps
 # Reference systems that differ from ICRS by more than 0.02 arcsec, by their names in metadata.
 _OLD_SYSTEMS = {"FK4": "fk4", "B1950": "fk4", "FK4-NO-E": "fk4noeterms"}
-_SEXAGESIMAL = re.compile(r"[-+]?\d{1,3}[: hd]\s*[0-5]?\d[: m'](\s*[0-5]?\d(\.\d*)?[s\"]?)?")
 
 
 def find_positions(spelled):
@@ -107,7 +120,7 @@ def read_positions(table, pair, name):
         If rows with impossible positions are left out, or positions are taken to be radians or are
         in single precision.
     """
-    found = [_angle(table[column], column, name) for column in pair]
+    found = [column_angles(table[column], column, name) for column in pair]
     values, unreadable = zip(*found, strict=True)
     factor = _radians_to_degrees(table, pair, values, name)
     ra, dec = (v * factor for v in values)
@@ -192,16 +205,40 @@ def plain_degrees(table):
     return *found, sure
 
 
-def _angle(column, label, name):
-    """Values in deg, or as they are without a unit, and a mask of unreadable cells."""
+def column_angles(column, label, name):
+    """Read a column of right ascension or declination, as numbers or as sexagesimal text.
+
+    Parameters
+    ----------
+    column : array_like
+        Column of a table.  Sexagesimal right ascension is in hours, unless the unit is deg.
+    label : str
+        Name of the column, which tells right ascension from declination.
+    name : str
+        Name of the input in messages.
+
+    Returns
+    -------
+    values : (N,) ndarray
+        Values in deg, or as they are if the column has no unit; NaN if missing or unreadable.
+    unreadable : (N,) ndarray of bool
+        Mask of cells that are neither missing nor an angle.
+
+    Raises
+    ------
+    CatalogError
+        If no cell can be read, or the unit is not one of an angle.
+    """
     unit = unit_of(column)
     try:
         values, unreadable = read_numbers(column)
     except ValueError as problem:
-        values = _sexagesimal(column, unit, label)
-        if values is None:
+        text = read_text(column)
+        declination = label.lower().lstrip("_").startswith(("d", "b"))
+        values = read_angles(text, hours=not declination and unit != u.deg)
+        if np.isnan(values).all():
             raise CatalogError(f"{name}: column {label!r} {problem}") from None
-        return values, np.isnan(values)
+        return values, np.isnan(values) & ~np.isin(np.char.lower(text), MISSING)
     if unit is None:
         return values, unreadable
     try:
@@ -211,18 +248,6 @@ def _angle(column, label, name):
         raise CatalogError(
             f"{name}: unit of column {label!r} must be an angle, got {given!r}"
         ) from None
-
-
-def _sexagesimal(column, unit, label):
-    """Degrees from ``10:00:00.5`` or ``10 00 00.5``: hours in right ascension; or `None`."""
-    text = read_text(column)
-    good = np.array([bool(_SEXAGESIMAL.fullmatch(t)) for t in text.tolist()], bool)
-    if not good.any():
-        return None
-    hours = not label.lower().lstrip("_").startswith(("d", "b")) and unit != u.deg
-    values = np.full(len(text), np.nan)
-    values[good] = Angle(text[good].tolist(), unit=u.hourangle if hours else u.deg).deg
-    return values
 
 
 def _radians_to_degrees(table, pair, values, name):

@@ -25,6 +25,14 @@ def catalog_source(source, *, url=None, cache=None, max_mag=None):
     object
         A `GaiaArchive` or `HatsCatalog`; otherwise `source` itself, such as the path of a file.  A
         file named ``gaia`` must be given as ``./gaia``.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.catalogs import catalog_source
+    >>> print(catalog_source("gaia", max_mag=19))
+    gaiadr3.gaia_source at https://gea.esac.esa.int/tap-server/tap, G <= 19
+    >>> catalog_source("./gaia")
+    './gaia'
     """
     if not isinstance(source, str):
         return source

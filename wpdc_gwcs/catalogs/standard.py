@@ -203,6 +203,14 @@ def identity_of(catalog):
     -------
     str or None
         The same for all parts; `None` for a catalog that was read whole.
+
+    Examples
+    --------
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs.catalogs import identity_of, read_catalog
+    >>> catalog = read_catalog(Table({"ra": [10.0], "dec": [20.0]}))
+    >>> print(identity_of(catalog))
+    None
     """
     return catalog.meta.get(_IDENTITY)
 

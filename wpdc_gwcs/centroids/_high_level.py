@@ -12,6 +12,7 @@ from wpdc_gwcs.centroids._photutils import from_photutils, to_photutils
 from wpdc_gwcs.centroids._psf import MIN_STARS, learn_psf
 from wpdc_gwcs.centroids._residual import Residual, Scene
 from wpdc_gwcs.centroids._rounds import MAX_CHI2, fit_all, judge_neighbors, near, noise_bins
+from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import CentroidWarning
 from wpdc_gwcs.flags import FLAG_FIT_FAILED
 from wpdc_gwcs.selection import select_sources
@@ -121,6 +122,17 @@ def measure_psf(
     -----
     CentroidWarning
         If there are too few stars.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import detect_sources, simulate
+    >>> from wpdc_gwcs.centroids import measure_psf
+    >>> from wpdc_gwcs.detection import subtract_background
+    >>> sky = simulate(1, image_shape=(256, 256), density=60, seed=1)
+    >>> background = subtract_background(sky.exposures[0].render())
+    >>> psf = measure_psf(background, detect_sources(background), vary="never")
+    >>> psf.coefficients.shape, psf.oversampling
+    ((1, 81, 81), 4)
     """
     field, unit = _field_of(data, error)
     if vary not in ("auto", "never"):
@@ -135,9 +147,9 @@ def measure_psf(
         if profile is not None:
             return profile
     where = "" if name is None else f"{name}: "
+    found = counted(len(rows), "bright, clean, isolated star")
     warnings.warn(
-        f"{where}no effective PSF: {len(rows)} bright, clean, isolated stars, {MIN_STARS} needed; "
-        "positions are windowed centroids",
+        f"{where}no effective PSF: {found}, {MIN_STARS} needed; positions are windowed centroids",
         CentroidWarning,
     )
     return None
@@ -276,6 +288,19 @@ def residual_of(background, sources, epsf, *, gain=None, subtracted=False):
     -------
     Residual
         Source of rows of the residual image, for `detect_companions`.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import detect_sources, fit_centroids, simulate
+    >>> from wpdc_gwcs.centroids import measure_psf, residual_of
+    >>> from wpdc_gwcs.detection import subtract_background
+    >>> sky = simulate(1, image_shape=(256, 256), density=60, seed=1)
+    >>> background = subtract_background(sky.exposures[0].render())
+    >>> sources = detect_sources(background)
+    >>> psf = measure_psf(background, sources)
+    >>> residual = residual_of(background, fit_centroids(background, sources, psf), psf)
+    >>> residual.rows(100, 150).shape  # only these rows are computed
+    (50, 256)
     """
     drawn = np.isfinite(np.asarray(sources["chi2"], dtype=float))
     stars = _stars_of(sources, background.unit).take(drawn)
@@ -305,7 +330,16 @@ def subtract_stars(background, sources, epsf, *, gain=None):
 
     Examples
     --------
-    See `wpdc_gwcs.detection.detect_companions`.
+    >>> from wpdc_gwcs import detect_sources, fit_centroids, simulate
+    >>> from wpdc_gwcs.centroids import measure_psf, subtract_stars
+    >>> from wpdc_gwcs.detection import subtract_background
+    >>> sky = simulate(1, image_shape=(256, 256), density=60, seed=1)
+    >>> background = subtract_background(sky.exposures[0].render())
+    >>> sources = detect_sources(background)
+    >>> psf = measure_psf(background, sources)
+    >>> residual = subtract_stars(background, fit_centroids(background, sources, psf), psf)
+    >>> [int((field.image > 10 * field.rms).sum()) for field in (background, residual)]
+    [473, 0]
     """
     return residual_of(background, sources, epsf, gain=gain).rows(0, background.shape[0])
 
@@ -325,6 +359,18 @@ class StarNoise:
         Error of the PSF at its peak, relative to the peak.
     n_stars : int
         Number of stars used.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import detect_sources, simulate
+    >>> from wpdc_gwcs.centroids import measure_noise, measure_psf
+    >>> from wpdc_gwcs.detection import subtract_background
+    >>> sky = simulate(1, image_shape=(300, 300), density=60, seed=1)
+    >>> background = subtract_background(sky.exposures[0].render())
+    >>> sources = detect_sources(background)
+    >>> noise = measure_noise(background, sources, measure_psf(background, sources))
+    >>> noise.n_stars > 50, noise.mismatch < 0.01
+    (True, True)
     """
 
     gain: float
@@ -360,7 +406,15 @@ def measure_noise(data, sources, epsf, *, error=None):
 
     Examples
     --------
-    See `fit_centroids`.
+    >>> from wpdc_gwcs import detect_sources, simulate
+    >>> from wpdc_gwcs.centroids import measure_noise, measure_psf
+    >>> from wpdc_gwcs.detection import subtract_background
+    >>> sky = simulate(1, image_shape=(400, 400), density=60, seed=1)
+    >>> background = subtract_background(sky.exposures[0].render())
+    >>> sources = detect_sources(background)
+    >>> noise = measure_noise(background, sources, measure_psf(background, sources))
+    >>> sky.camera.gain, 1.0 < noise.gain < 2.0
+    (1.5, True)
     """
     field, unit = _field_of(data, error, saturation=sources.meta.get("saturation"))
     fwhm = _typical_fwhm(sources)

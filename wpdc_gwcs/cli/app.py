@@ -111,11 +111,24 @@ def set_verbosity(verbose, quiet):
     warnings.showwarning = show
 
 
-def _fail(message, status):
+def _fail(message, status, args=None):
     text = " ".join(str(message).split())
     hint = hint_of(text)
+    if hint and hint.startswith("--") and hint.split()[0].strip(",") not in _options_of(args):
+        # It is for another command that reads the same kind of file.
+        hint = None
     print(f"wpdc: error: {text}" + (f"; try: {hint}" if hint else ""), file=sys.stderr)
     return status
+
+
+def _options_of(args):
+    """Options of the command that was called, by their names."""
+    command = typer.main.get_command(app)
+    for word in sys.argv[1:] if args is None else args:
+        if word not in getattr(command, "commands", ()):
+            break
+        command = command.commands[word]
+    return {name for parameter in command.params for name in parameter.opts}
 
 
 def run(args=None):
@@ -179,12 +192,13 @@ def _run(args, received):
     except UsageError as err:
         return _usage(err)
     except InputError as err:
-        return _fail(err, 2)
+        return _fail(err, 2, args)
     except (FrameFailure, WPDCError) as err:
-        return _fail(err, 1)
+        return _fail(err, 1, args)
     except (KeyboardInterrupt, typer.Abort):
         status = 128 + received[0] if received else _INTERRUPTED
-        return _fail("interrupted; files already written are complete", status)
+        more = "; go on with --resume" if "--resume" in _options_of(args) else ""
+        return _fail(f"interrupted; files already written are complete{more}", status)
     except BrokenPipeError:
         # The reader of our output is gone, which is not an error; the exit must not flush again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -11,7 +11,16 @@ import typer
 
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.inputs import expand_paths
-from wpdc_gwcs.cli.options import Cache, Overwrite, Quiet, TapUrl, Verbose, require_free
+from wpdc_gwcs.cli.options import (
+    Cache,
+    Overwrite,
+    Quiet,
+    TapUrl,
+    Verbose,
+    read_numbers,
+    require_free,
+)
+from wpdc_gwcs.cli.positions import read_position
 from wpdc_gwcs.exceptions import InputError
 from wpdc_gwcs.extras import require
 
@@ -24,7 +33,10 @@ app.add_typer(catalog_app, name="catalog")
 
 Cone = Annotated[
     str | None,
-    typer.Option(metavar="RA,DEC,RADIUS", help="Part of the sky: a cone, deg."),
+    typer.Option(
+        metavar="RA,DEC,RADIUS",
+        help="Part of the sky: a cone, deg; the center also as 12:34:56.7,-01:02:03.",
+    ),
 ]
 Box = Annotated[
     str | None,
@@ -237,9 +249,9 @@ def _sky(cone, box, around):
         raise InputError("only one of --cone, --box and --around may be given")
     try:
         if cone:
-            region = Region(*_numbers("--cone", cone, 3))
+            region = Region(*_cone(cone))
         elif box:
-            west, east, south, north = _numbers("--box", box, 4)
+            west, east, south, north = read_numbers("--box", box, 4)
             region = Region.box(west, east, south, north)
             width = (east - west) % 360.0 or 360.0
 
@@ -259,15 +271,12 @@ def _sky(cone, box, around):
     )
 
 
-def _numbers(option, text, n):
+def _cone(text):
     cells = re.split(r"[,\s]+", text.strip())
-    try:
-        numbers = [float(cell) for cell in cells]
-    except ValueError:
-        numbers = []
-    if len(numbers) != n:
-        raise InputError(f"{option} must be {n} numbers separated by commas, got {text!r}")
-    return numbers
+    if len(cells) != 3:
+        raise InputError(f"--cone must be RA,DEC,RADIUS, got {text!r}")
+    position = read_position(cells[:2], "--cone")
+    return *position, *read_numbers("the radius of --cone", cells[2], 1)
 
 
 def _region_of(paths):

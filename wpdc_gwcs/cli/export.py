@@ -1,5 +1,7 @@
 """Exchange of WCSs with other programs: `export`, `convert`."""
 
+import contextlib
+import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -9,8 +11,11 @@ from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.completion import one_of
 from wpdc_gwcs.cli.files import read_one, wcs_files
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free
+from wpdc_gwcs.columns import listed
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
+
+log = logging.getLogger("wpdc_gwcs.cli")
 
 # The deviation in SWarp is reported if it exceeds that of other readers by this factor and is not
 # negligible.
@@ -67,7 +72,8 @@ def export_command(
         str | None,
         typer.Option(
             metavar="IMAGE[EXT]",
-            help="Replace the WCS of this image.",
+            help="Replace the WCS of this image; with several FILEs or a folder of results, the "
+            "WCSs of its extensions.",
         ),
     ] = None,
     degree: Degree = None,
@@ -83,7 +89,8 @@ def export_command(
 ):
     """Write a WCS in a format for other programs.
 
-    The deviation of the written WCS from the exact one is printed.
+    The deviation of the written WCS from the exact one is printed.  With --into, a folder of
+    results stands for the WCS files of the image.
     """
     if format is None and into is not None:
         format = "tpv"
@@ -95,28 +102,36 @@ def export_command(
         raise InputError("export needs --output FILE or DIR, or --into IMAGE")
     if alternates not in ("keep", "remove"):
         raise InputError(f"--alternates must be keep or remove, got {alternates!r}")
-    found = wcs_files(files)
     if into is not None:
-        if len(found) > 1:
-            raise InputError(f"--into takes one FILE, got {len(found)}")
-        places = {found[0]: output}
+        if output is not None:
+            require_free(output, overwrite)
+        lines = _into(files, into, format, degree, output, alternates, overwrite)
     else:
-        places = _places(found, output, format, in_folder=found != files or len(files) > 1)
+        lines = _one_by_one(files, output, format, degree, overwrite)
+    for line in lines:
+        if not quiet:
+            typer.echo(line)
+
+
+def _one_by_one(files, output, format, degree, overwrite):
+    """Write a file for each file; yield what to print."""
+    found = wcs_files(files)
+    places = _places(found, output, format, in_folder=found != files or len(files) > 1)
     for place in places.values():
-        if place is not None:
-            require_free(place, overwrite)
+        require_free(place, overwrite)
     for file, place in places.items():
         calibration = read_one(file)
-        try:
-            if into is not None:
-                where, note = _into(calibration, into, format, degree, place, alternates, overwrite)
-            else:
-                where = place
-                note = write_as(calibration, place, format, degree=degree, overwrite=overwrite)
-        except ValueError as err:
-            raise InputError(str(err)) from err
-        if not quiet:
-            typer.echo(f"{where}: written as {format}{note}")
+        with _as_input_error():
+            note = write_as(calibration, place, format, degree=degree, overwrite=overwrite)
+        yield f"{place}: written as {format}{note}"
+
+
+@contextlib.contextmanager
+def _as_input_error():
+    try:
+        yield
+    except ValueError as err:
+        raise InputError(str(err)) from err
 
 
 def _places(files, output, format, *, in_folder):
@@ -135,23 +150,61 @@ def _places(files, output, format, *, in_folder):
     return places
 
 
-def _into(calibration, image, format, degree, output, alternates, overwrite):
-    from wpdc_gwcs.io.embed import INTO_FORMS, write_into
+def _into(files, image, format, degree, output, alternates, overwrite):
+    """Write one WCS into an image, or all of its extensions at once; return what to print."""
+    from wpdc_gwcs.catalogs.files import split_extension
+    from wpdc_gwcs.io.embed import INTO_FORMS, image_numbers, write_into
 
     if format not in INTO_FORMS:
         raise InputError(
             f"--format must be one of {', '.join(INTO_FORMS)} with --into, got {format!r}"
         )
-    made = write_into(
-        calibration,
-        image,
-        form=format,
-        degree=degree,
-        output=output,
-        alternates=alternates,
-        overwrite=overwrite,
-    )
-    return image if output is None else output, _note(made)
+    path, extension = split_extension(image)
+    folder = any(file.is_dir() for file in files)
+    if extension is not None and (folder or len(files) > 1):
+        raise InputError(
+            f"--into {image} takes one FILE; without [{extension}], all extensions are written"
+        )
+    target = image if output is None else output
+    if folder or len(files) > 1 or (extension is None and len(image_numbers(path)) > 1):
+        given, owners = _calibrations_of(files, path)
+        places = [f"{target}[{number}]: {owners[number].name}" for number in given]
+    else:
+        given, places = read_one(files[0]), [f"{target}:"]
+    with _as_input_error():
+        made = write_into(
+            given,
+            image,
+            form=format,
+            degree=degree,
+            output=output,
+            alternates=alternates,
+            overwrite=overwrite,
+        )
+    forms = made.values() if isinstance(made, dict) else [made]
+    return [
+        f"{place} written as {format}{_note(one)}" for place, one in zip(places, forms, strict=True)
+    ]
+
+
+def _calibrations_of(files, image):
+    """Calibrations for the extensions of an image by their numbers, and the files they are from."""
+    from wpdc_gwcs.io.assignment import assign_extensions, frames_of_image
+
+    frames = frames_of_image(image)
+    names = [f"{frame.name}.wcs.asdf" for frame in frames.values()]
+    found = []
+    for file in files:
+        inside = [file]
+        if file.is_dir() and not (inside := [file / n for n in names if (file / n).exists()]):
+            raise InputError(f"{file}: has no WCS file of {image}, such as {names[0]}")
+        found += inside
+    calibrations = {file: read_one(file) for file in dict.fromkeys(found)}
+    owners = assign_extensions(image, frames, calibrations)
+    left = [frames[number].name for number in sorted(set(frames) - set(owners))]
+    if left:
+        log.warning("%s: no WCS for %s: left as it was", image, listed(left, kind="frames"))
+    return {number: calibrations[file] for number, file in owners.items()}, owners
 
 
 def write_as(calibration, output, format, *, degree=None, overwrite=False):

@@ -9,6 +9,8 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.completion import one_of
 from wpdc_gwcs.cli.options import Overwrite
+from wpdc_gwcs.cli.positions import read_position, require_on_sphere
+from wpdc_gwcs.columns import listed, spelled_names
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
 
@@ -78,21 +80,24 @@ def pix2sky_command(
     "sky2pix",
     no_args_is_help=True,
     context_settings={"ignore_unknown_options": True},
-    epilog="Example: wpdc sky2pix results/image.wcs.asdf 294.63 35.18",
+    epilog="Example: wpdc sky2pix results/image.wcs.asdf 19:38:31.2 +35:10:48",
 )
 def sky2pix_command(
     file: CalibrationFile,
     points: Annotated[
         list[str],
         typer.Argument(
-            metavar="RA DEC | TABLE", help="ICRS position in deg, or a table with ra, dec."
+            metavar="RA DEC | TABLE",
+            help="ICRS position, or a table with ra, dec.  Plain numbers are in deg.  In a "
+            "sexagesimal position such as 12:34:56.7 -01:02:03, ra is in hours, unless units say "
+            "something else (188d44m10s).",
         ),
     ],
     origin: Origin = 0,
     output: Output = None,
     overwrite: Overwrite = False,
 ):
-    """Convert RA and Dec (ICRS, deg) to pixels.
+    """Convert RA and Dec (ICRS) to pixels.
 
     A table gets the columns x and y.  Positions outside the detector become nan.
     """
@@ -111,11 +116,11 @@ def _transform(file, points, origin, output, overwrite, *, forward):
         x, y = wcs.invert(a, b)
         return x + origin, y + origin
 
-    if len(points) == 1 and not (_is_number(points[0]) and not Path(points[0]).exists()):
+    if len(points) == 1 and Path(points[0]).exists():
         _transform_table(points[0], names, transform, output, overwrite)
         return
-    a, b = _numbers(points, names[:2])
-    result = [float(value) for value in transform(a, b)]
+    read_point = _read_pixel if forward else _read_sky
+    result = [float(value) for value in transform(*read_point(points))]
     if not np.all(np.isfinite(result)):
         where = "detector" if forward else "sky of the detector"
         typer.echo("nan nan")
@@ -123,6 +128,37 @@ def _transform(file, points, origin, output, overwrite, *, forward):
         raise typer.Exit(1)
     digits = 10 if forward else 5
     typer.echo(" ".join(f"{value:.{digits}f}" for value in result))
+
+
+def _read_pixel(points):
+    words = _two_words(points, ("x", "y"))
+    try:
+        return [np.float64(word) for word in words]
+    except ValueError as err:
+        raise InputError(f"x and y must be numbers, got {' '.join(points)} (in px)") from err
+
+
+def _read_sky(points):
+    return read_position(_two_words(points, ("ra", "dec")))
+
+
+def _two_words(points, names):
+    """Split arguments into two coordinates: ``a b``, ``"a b"``, ``a, b``, ``h m s d m s``."""
+    words = [point.strip(" ,") for point in points]
+    if len(words) != 2:
+        words = " ".join(points).replace(",", " ").split()
+    if len(words) == 6:
+        words = [" ".join(words[:3]), " ".join(words[3:])]
+    if len(words) != 2:
+        if len(points) == 1 and not _is_number(points[0]):
+            raise InputError(
+                f"{points[0]}: no such file; give {names[0]} and {names[1]}, or one table"
+            )
+        raise InputError(
+            f"give {names[0]} and {names[1]}, or one table; got {counted(len(words), 'value')}: "
+            f"{' '.join(points)}"
+        )
+    return words
 
 
 def _is_number(text):
@@ -133,26 +169,15 @@ def _is_number(text):
     return True
 
 
-def _numbers(points, names):
-    if len(points) != 2:
-        raise InputError(
-            f"give {names[0]} and {names[1]}, or one table; got {counted(len(points), 'value')}: "
-            f"{' '.join(points)}"
-        )
-    try:
-        return [np.float64(p) for p in points]
-    except ValueError as err:
-        unit = "deg" if names[0] == "ra" else "px"
-        raise InputError(
-            f"{names[0]} and {names[1]} must be numbers, got {' '.join(points)} (in {unit})"
-        ) from err
-
-
 def _transform_table(path, names, transform, output, overwrite):
     from wpdc_gwcs.io import read_table, write_table
 
-    table = read_table(path, columns=names[:2])
-    a, b = (np.asarray(table[name], float) for name in names[:2])
+    if names[0] == "ra":
+        table = read_table(path)
+        a, b = _table_sky(table, path)
+    else:
+        table = read_table(path, columns=names[:2])
+        a, b = (np.asarray(table[name], float) for name in names[:2])
     c, d = transform(a, b)
     unit = "deg" if names[2] == "ra" else "pix"
     for name, values in zip(names[2:], (c, d), strict=True):
@@ -162,6 +187,29 @@ def _transform_table(path, names, transform, output, overwrite):
         table.write(typer.get_text_stream("stdout"), format="ascii.ecsv")
     else:
         write_table(table, output, overwrite=overwrite)
+
+
+def _table_sky(table, path):
+    """Right ascension and declination of a table in deg; NaN where they are missing."""
+    from wpdc_gwcs.catalogs.positions import column_angles, find_positions
+
+    pair = find_positions(spelled_names(table.colnames))
+    if pair is None:
+        raise InputError(
+            f"{path}: table must have columns 'ra' and 'dec', has {listed(table.colnames)}"
+        )
+    values = []
+    for name in pair:
+        found, unreadable = column_angles(table[name], name, path)
+        if unreadable.any():
+            row = int(np.flatnonzero(unreadable)[0])
+            raise InputError(
+                f"{path}: column {name!r} must hold angles, got {str(table[name][row])!r} in row "
+                f"{row}"
+            )
+        values.append(found)
+    require_on_sphere(pair, values, path=path)
+    return values
 
 
 def match_files(paths):

@@ -36,6 +36,8 @@ Picture = Annotated[
     Path | None,
     typer.Option("--output", metavar="FILE", help="Also draw a picture: .png, .pdf or .svg."),
 ]
+# Width of the names at the beginning of lines.
+_LABEL = 11
 # Maximum number of rows shown; the rest is counted.
 _MOST_ROWS = 20
 
@@ -60,7 +62,7 @@ def show_command(
     _check_picture(output, overwrite)
     lines, draw = _told(file)
     for label, text in lines:
-        typer.echo(f"{label:<11} {text}")
+        typer.echo(f"{label:<{_LABEL}} {text}")
     if output is not None:
         _save(draw(), output, overwrite=overwrite)
 
@@ -140,7 +142,7 @@ def _save(figure, path, *, overwrite):
 
     with atomic_path(path, overwrite=overwrite) as temporary:
         figure.savefig(temporary, dpi=120, format=path.suffix[1:].lower())
-    typer.echo(f"{'picture':<12}{path}")
+    typer.echo(f"{'picture':<{_LABEL}} {path}")
 
 
 def _told(file):
@@ -181,11 +183,11 @@ def _of_folder(path):
     if not (path / "summary.ecsv").is_file():
         raise InputError(f"{path}: must be a folder of results, has no summary.ecsv")
     lines, draw = _of_table(path, read_table(path / "summary.ecsv"))
-    for ending in ("wcs.asdf", "solution.asdf", "camera.asdf"):
-        names = sorted(found.name for found in path.glob(f"*.{ending}"))
+    for kind, ending in (("WCS", "wcs"), ("solutions", "solution"), ("cameras", "camera")):
+        names = sorted(found.name for found in path.glob(f"*.{ending}.asdf"))
         if names:
             more = f", ... ({len(names)} files)" if len(names) > 3 else ""
-            lines.append((ending, ", ".join(names[:3]) + more))
+            lines.append((kind, ", ".join(names[:3]) + more))
     return lines, draw
 
 

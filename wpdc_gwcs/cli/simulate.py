@@ -9,6 +9,7 @@ import typer
 from wpdc_gwcs.cli.app import app
 from wpdc_gwcs.cli.completion import complete, one_of
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, read_numbers
+from wpdc_gwcs.cli.positions import read_position
 from wpdc_gwcs.cli.progress import progress_bar
 from wpdc_gwcs.exceptions import InputError
 
@@ -53,7 +54,7 @@ def simulate_command(
         list[str] | None,
         typer.Option(
             metavar="RA,DEC",
-            help="Center of a field, ICRS in deg, or as 6h48m59s,-36d00m18s; one for each field.",
+            help="Center of a field, ICRS in deg, or as 6:48:59,-36:00:18; one for each field.",
         ),
     ] = None,
     images: Annotated[
@@ -308,20 +309,16 @@ def _epochs(text, n_exposures):
 
 def _centers(texts, fields, seed):
     """Centers of the fields: the given ones, and random ones on the sky for the rest."""
-    from astropy import units as u
-    from astropy.coordinates import Angle, SkyCoord
+    from astropy.coordinates import SkyCoord
 
     ra, dec = [], []
     for text in texts:
-        parts = text.split(",")
-        try:
-            a, d = (Angle(part.strip(), unit=u.deg) for part in parts)
-            if not (np.isfinite(a.deg) and abs(d.deg) <= 90):
-                raise ValueError
-        except (ValueError, u.UnitsError) as err:
-            raise InputError(f"--center must be RA,DEC in deg, got {text!r}") from err
-        ra.append(a.deg % 360)
-        dec.append(d.deg)
+        parts = [part.strip() for part in text.split(",")]
+        if len(parts) != 2:
+            raise InputError(f"--center must be RA,DEC, got {text!r}")
+        a, d = read_position(parts, "--center")
+        ra.append(a % 360)
+        dec.append(d)
     n = max(len(ra), 1) if fields is None else fields
     if n < max(len(ra), 1):
         raise InputError(f"--fields must be at least {max(len(ra), 1)}, got {n}")

@@ -52,6 +52,17 @@ class Background:
     photons : (ny, nx) float32 ndarray or None, optional
         Variance of the photons of a star relative to that by the gain, if pixels differ in response
         or exposure, which is known from a weight map or the filters of a mosaic; None otherwise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.detection import subtract_background
+    >>> image = np.random.default_rng(1).normal(100, 5, (200, 200))
+    >>> background = subtract_background(image)
+    >>> round(background.level), round(float(background.noise))
+    (100, 5)
+    >>> bool(abs(background.image.mean()) < 0.1)
+    True
     """
 
     image: np.ndarray

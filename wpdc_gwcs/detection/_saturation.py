@@ -27,6 +27,18 @@ def saturation_problem(background, saturation):
     -------
     str or None
         The contradiction, None where there is none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.detection import saturation_problem, subtract_background
+    >>> image = np.random.default_rng(1).normal(100, 5, (200, 200))
+    >>> image[50:55, 50:55] = 60000
+    >>> background = subtract_background(image)
+    >>> print(saturation_problem(background, 60000.0))
+    None
+    >>> print(saturation_problem(background, 1000.0))
+    pixels of the image reach 6e+04
     """
     height = saturation - background.level
     if not height > _ABOVE_SKY * background.noise:

@@ -68,6 +68,28 @@ class Drift:
         ``sigma_dy`` in px, ``p_value`` of each cell alone, and ``changed``.  If there is a drift,
         the linear part of the unchanged cells is subtracted, and the stars of a changed cell are
         not used in larger cells around it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs import DistortionSolution, PVPolynomial, detect_drift
+    >>> cd, crpix, crval = np.diag([-2e-5, 2e-5]), np.array([499.5, 499.5]), np.array([10.0, 20.0])
+    >>> solution = DistortionSolution("d", (1000, 1000), crpix, cd, crval, PVPolynomial())
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 999, (2, 4000))
+    >>> dx, dy = rng.normal(0, 0.05, (2, 4000))
+    >>> dx[(x < 500) & (y < 500)] += 0.03  # one quarter has moved
+    >>> matches = Table({"x": x, "y": y, "dx": dx, "dy": dy})
+    >>> matches["x_err"] = matches["y_err"] = 0.05
+    >>> drift = detect_drift(solution, matches)
+    >>> drift.drifted, drift.p_value < drift.false_alarm, round(drift.area, 2)
+    (True, True, 0.25)
+    >>> print(drift.cells["x_min", "x_max", "y_min", "y_max"][:1])
+    x_min x_max y_min y_max
+     pix   pix   pix   pix
+    ----- ----- ----- -----
+     -0.5 499.5  -0.5 499.5
     """
 
     drifted: bool

@@ -41,6 +41,25 @@ class DriftHistory:
     cells : `~astropy.table.QTable`
         Means in 4 x 4 cells for each period: ``period`` (row of ``periods``), ``x_min``,
         ``x_max``, ``y_min``, ``y_max``, ``n``, ``dx``, ``dy``, ``sigma_dx``, ``sigma_dy`` (px).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs import DistortionSolution, PVPolynomial, track_drift
+    >>> cd, crpix, crval = np.diag([-2e-5, 2e-5]), np.array([499.5, 499.5]), np.array([10.0, 20.0])
+    >>> solution = DistortionSolution("d", (1000, 1000), crpix, cd, crval, PVPolynomial())
+    >>> rng, periods = np.random.default_rng(1), []
+    >>> for year, bend in ((2020.0, 0.0), (2021.0, 0.03)):
+    ...     x, y = rng.uniform(0, 999, (2, 4000))
+    ...     dx, dy = rng.normal(0, 0.05, (2, 4000))
+    ...     dx[x < 500] += bend * np.sin(y[x < 500] / 150)
+    ...     table = Table({"x": x, "y": y, "dx": dx, "dy": dy, "used": x >= 0})
+    ...     table["x_err"] = table["y_err"] = 0.05
+    ...     periods.append(([year], [table]))
+    >>> history = track_drift(solution, periods)
+    >>> history.periods["drifted"].tolist(), len(history.cells) // len(history.periods)
+    ([False, True], 16)
     """
 
     detector: str
@@ -108,6 +127,25 @@ def residuals_of_attitude(calibration, matches):
     `~astropy.table.Table`
         The matches, or a copy with the field added back to ``dx`` and ``dy`` without its linear
         part, which the attitude absorbs.  This is needed because a field also absorbs a drift.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs import Calibration, DistortionSolution, LookupTable, PVPolynomial
+    >>> from wpdc_gwcs.evaluation import residuals_of_attitude
+    >>> cd, crpix, crval = np.diag([-2e-5, 2e-5]), np.array([499.5, 499.5]), np.array([10.0, 20.0])
+    >>> solution = DistortionSolution("d", (1000, 1000), crpix, cd, crval, PVPolynomial())
+    >>> grid = np.linspace(-0.5, 999.5, 20)
+    >>> shift = np.tile(0.1 * np.sin(grid / 100), (20, 1))
+    >>> wave = LookupTable(grid, grid, shift, 0 * shift)
+    >>> frame = Calibration("a", solution, crval=crval, cd=cd, field=wave)
+    >>> x, y = np.random.default_rng(1).uniform(0, 999, (2, 500))
+    >>> matches = Table({"x": x, "y": y, "dx": 0 * x, "dy": 0 * x, "used": x >= 0})
+    >>> matches["x_err"] = matches["y_err"] = 0.05
+    >>> without_field = residuals_of_attitude(frame, matches)
+    >>> float(matches["dx"].std()), float(without_field["dx"].std().round(2))
+    (0.0, 0.07)
     """
     if calibration.field is None:
         return matches

@@ -60,6 +60,18 @@ class DetectorResiduals:
         run, the mean over its detectors.
     limit : float
         The limit, px.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import Settings, calibrate, simulate
+    >>> from wpdc_gwcs.evaluation import pool_residuals
+    >>> sky = simulate(1, image_shape=(256, 256), density=120, distortion=2, seed=1)
+    >>> run = calibrate([sky.exposures[0].frame()], sky.reference, settings=Settings(lut="none"))
+    >>> (pooled,) = pool_residuals(run.calibrations)
+    >>> pooled.detector, pooled.statistics.n == len(pooled.x)
+    ('sim', True)
+    >>> round(pooled.sigma_alpha / pooled.statistics.sigma_dx / 300)  # the pixel scale is 300 mas
+    1
     """
 
     detector: str
@@ -186,6 +198,18 @@ def tabulate_detectors(residuals):
         One row each: ``detector``, ``n_frames``, ``stars``, the fields of `ResidualStatistics` in
         px, ``mean_alpha``, ``sigma_alpha``, ``mean_delta``, ``sigma_delta`` in mas,
         ``share_below`` and its ``limit`` in px.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import Settings, calibrate, simulate
+    >>> from wpdc_gwcs.evaluation import pool_residuals, tabulate_detectors
+    >>> sky = simulate(1, image_shape=(256, 256), density=120, distortion=2, seed=1)
+    >>> run = calibrate([sky.exposures[0].frame()], sky.reference, settings=Settings(lut="none"))
+    >>> table = tabulate_detectors(pool_residuals(run.calibrations))
+    >>> print(table["detector", "n_frames", "stars"])
+    detector n_frames stars
+    -------- -------- -----
+         sim        1  used
     """
     moments = ("mean_alpha", "sigma_alpha", "mean_delta", "sigma_delta", "share_below", "limit")
     return QTable(
@@ -225,6 +249,17 @@ def format_table(residuals, *, form="ascii"):
     References
     ----------
     WPDC-2P, arXiv:2603.09193, table 2.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import Settings, calibrate, simulate
+    >>> from wpdc_gwcs.evaluation import format_table, pool_residuals
+    >>> sky = simulate(1, image_shape=(256, 256), density=120, distortion=2, seed=1)
+    >>> run = calibrate([sky.exposures[0].frame()], sky.reference, settings=Settings(lut="none"))
+    >>> print(format_table(pool_residuals(run.calibrations)))
+    Detector ID   mean_dx  sigma_dx   mean_dy  sigma_dy
+    ---------------------------------------------------
+    sim            -0.002     0.054    -0.001     0.052
     """
     if form not in ("ascii", "latex"):
         raise ValueError(f"form must be 'ascii' or 'latex', got {form!r}")

@@ -59,6 +59,19 @@ class TruthScore:
         The same ratio for the measured positions, for the right pairs in the fit.
     error_x, error_y : (n, n) ndarray
         Error of the WCS on the grid over the detector, px; NaN outside the cuts.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import Settings, calibrate, simulate
+    >>> from wpdc_gwcs.evaluation import score_frame
+    >>> sky = simulate(1, image_shape=(256, 256), density=120, distortion=2, seed=1)
+    >>> exposure = sky.exposures[0]
+    >>> run = calibrate([exposure.frame()], sky.reference, settings=Settings(lut="none"))
+    >>> stars = exposure.observe()[1]
+    >>> stars.rename_column("reference_index", "catalog_index")
+    >>> score = score_frame(run.calibrations[0], exposure, stars)
+    >>> score.wcs_rms < 0.05, score.wcs_rms < score.wcs_max, score.n_wrong
+    (True, True, 0)
     """
 
     frame: str
@@ -111,6 +124,19 @@ def score_frame(calibration, truth, stars, *, cuts=None, limit=0.01, n_grid=101)
     ------
     ValueError
         If the calibration has no matches, or is of another detector.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import Settings, calibrate, simulate
+    >>> from wpdc_gwcs.evaluation import score_frame
+    >>> sky = simulate(1, image_shape=(256, 256), density=120, distortion=2, seed=1)
+    >>> exposure = sky.exposures[0]
+    >>> run = calibrate([exposure.frame()], sky.reference, settings=Settings(lut="none"))
+    >>> stars = exposure.observe()[1]
+    >>> stars.rename_column("reference_index", "catalog_index")
+    >>> score = score_frame(run.calibrations[0], exposure, stars)
+    >>> score.n_matched == len(run.calibrations[0].matches), score.n_wrong
+    (True, 0)
     """
     m, solution = calibration.matches, calibration.solution
     if m is None:
@@ -228,6 +254,22 @@ def pool_scores(scores):
     ------
     ValueError
         If there are no scores.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import Settings, calibrate, simulate
+    >>> from wpdc_gwcs.evaluation import pool_scores, score_frame
+    >>> sky = simulate(2, image_shape=(256, 256), density=120, distortion=2, seed=1)
+    >>> frames = [exposure.frame() for exposure in sky.exposures]
+    >>> run = calibrate(frames, sky.reference, settings=Settings(lut="none"))
+    >>> scores = []
+    >>> for exposure, calibration in zip(sky.exposures, run.calibrations):
+    ...     stars = exposure.observe()[1]
+    ...     stars.rename_column("reference_index", "catalog_index")
+    ...     scores.append(score_frame(calibration, exposure, stars))
+    >>> (detector,) = pool_scores(scores)
+    >>> detector.n_frames, detector.n_matched == sum(score.n_matched for score in scores)
+    (2, True)
     """
     if not isinstance(scores, Sequence) or not scores:
         raise ValueError("pool_scores needs the scores of at least one frame")
@@ -285,6 +327,21 @@ def tabulate_scores(scores):
     -------
     `~astropy.table.QTable`
         One row each, with all fields of `TruthScore` except the errors on the grid.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import Settings, calibrate, simulate
+    >>> from wpdc_gwcs.evaluation import score_frame, tabulate_scores
+    >>> sky = simulate(1, image_shape=(256, 256), density=120, distortion=2, seed=1)
+    >>> exposure = sky.exposures[0]
+    >>> run = calibrate([exposure.frame()], sky.reference, settings=Settings(lut="none"))
+    >>> stars = exposure.observe()[1]
+    >>> stars.rename_column("reference_index", "catalog_index")
+    >>> table = tabulate_scores([score_frame(run.calibrations[0], exposure, stars)])
+    >>> print(table["frame", "detector", "n_wrong"])
+    frame  detector n_wrong
+    ------ -------- -------
+    sim-01      sim       0
     """
     return QTable(
         [{k: v for k, v in vars(s).items() if k not in ("error_x", "error_y")} for s in scores]

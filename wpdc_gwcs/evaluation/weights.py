@@ -43,6 +43,15 @@ class WeightResult:
         Pixels of the stars, zero based.
     distance : (N,) ndarray, optional
         Their distances from the reference point, px.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import Settings, calibrate, compare_weights, simulate
+    >>> sky = simulate(1, image_shape=(256, 256), density=120, distortion=2, seed=1)
+    >>> run = calibrate([sky.exposures[0].frame()], sky.reference, settings=Settings(lut="none"))
+    >>> result = compare_weights(run.calibrations, weights=["uniform"])[0]
+    >>> result.weight.name, result.held_out, result.statistics.n == len(result.dx)
+    ('uniform', False, True)
     """
 
     weight: RadialWeight
@@ -246,6 +255,19 @@ def tabulate_weights(results):
     `~astropy.table.QTable`
         Two rows for each weight: ``weight``, ``r0``, ``table`` (``no`` or ``yes``), ``stars``
         (``used`` or ``holdout``) and the fields of `ResidualStatistics`.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import Settings, calibrate, compare_weights, simulate
+    >>> from wpdc_gwcs.evaluation import tabulate_weights
+    >>> sky = simulate(1, image_shape=(256, 256), density=120, distortion=2, seed=1)
+    >>> run = calibrate([sky.exposures[0].frame()], sky.reference, settings=Settings(lut="none"))
+    >>> table = tabulate_weights(compare_weights(run.calibrations, weights=["uniform"]))
+    >>> print(table["weight", "table", "stars"])
+     weight table stars
+    ------- ----- -----
+    uniform    no  used
+    uniform   yes  used
     """
     return QTable(
         [

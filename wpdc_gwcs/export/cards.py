@@ -28,6 +28,13 @@ def number_card(keyword, value, comment=""):
     -------
     card : `~astropy.io.fits.Card`
         The card.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.export import number_card
+    >>> card = number_card("CRVAL1", 0.1 + 0.2, "[deg]")
+    >>> print(str(card).rstrip())
+    CRVAL1  =   3.0000000000000004E-01 / [deg]
     """
     text = f"{keyword:<8}= {float(value):>24.16E}"
     return fits.Card.fromstring(f"{text} / {comment}"[:80].ljust(80))
@@ -85,6 +92,17 @@ def frame_cards(obj):
     -------
     header : `~astropy.io.fits.Header`
         IMAGEW, IMAGEH, DETECTOR, FRAME, WPDCVERS, HISTORY.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import Calibration, DistortionSolution, PVPolynomial
+    >>> from wpdc_gwcs.export import frame_cards
+    >>> cd, crpix, crval = np.diag([-8e-5, 8e-5]), np.array([1023.5, 511.5]), np.array([10.0, 45.0])
+    >>> solution = DistortionSolution("d1", (1024, 2048), crpix, cd, crval, PVPolynomial())
+    >>> header = frame_cards(Calibration("night-07", solution, crval=crval, cd=cd))
+    >>> header["IMAGEW"], header["IMAGEH"], header["DETECTOR"], header["FRAME"]
+    (2048, 1024, 'd1', 'night-07')
     """
     from wpdc_gwcs import __version__
 
@@ -113,6 +131,15 @@ def add_history(header, text):
         Header, changed in place.
     text : str
         Text, of any length.
+
+    Examples
+    --------
+    >>> from astropy.io import fits
+    >>> from wpdc_gwcs.export import add_history
+    >>> header = fits.Header()
+    >>> add_history(header, "calibrated with " + 30 * "many ")
+    >>> len(header["HISTORY"]), max(len(line) for line in header["HISTORY"]) <= 72
+    (3, True)
     """
     for line in textwrap.wrap(_ascii(text), 70, subsequent_indent="  "):
         header.add_history(line)

@@ -67,6 +67,18 @@ def image_shape_of(obj):
     -------
     shape : (int, int) or None
         The stated shape, or else the one that the nodes of the table span.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import DistortionSolution, LookupTable, PVPolynomial
+    >>> from wpdc_gwcs.export import image_shape_of
+    >>> cd, crpix, crval = np.diag([-8e-5, 8e-5]), np.array([49.5, 99.5]), np.array([10.0, 45.0])
+    >>> table = LookupTable(np.linspace(-0.5, 99.5, 5), np.linspace(-0.5, 199.5, 5),
+    ...                     np.zeros((5, 5)), np.zeros((5, 5)))
+    >>> solution = DistortionSolution("d1", None, crpix, cd, crval, PVPolynomial(), table)
+    >>> image_shape_of(solution)
+    (200, 100)
     """
     shape, table = description(obj).solution.image_shape, obj.lookup_table
     if shape is None and table is not None:
@@ -114,6 +126,18 @@ def deviation(obj, sky, *, n=401):
     -------
     deviation : float
         Greatest distance in undistorted pixels; infinite if the other WCS returns NaN anywhere.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import DistortionSolution, PVPolynomial
+    >>> from wpdc_gwcs.export import deviation
+    >>> from wpdc_gwcs.models import TangentSky
+    >>> cd, crpix, crval = np.diag([-8e-5, 8e-5]), np.array([511.5, 511.5]), np.array([10.0, 45.0])
+    >>> shifted = PVPolynomial(pv1_0=1.6e-4)  # by 2 px
+    >>> solution = DistortionSolution("d1", (1024, 1024), crpix, cd, crval, shifted)
+    >>> round(deviation(solution, TangentSky(crpix, cd, crval)), 6)
+    2.0
     """
     exact = description(obj)
     ny, nx = require_shape(obj)

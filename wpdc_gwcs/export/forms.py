@@ -55,6 +55,17 @@ class FitsForm:
         approximately.
     written : Calibration or DistortionSolution or None
         For ``fits`` and ``cpdis``: the same mapping, with the polynomial of the keywords.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import DistortionSolution, PVPolynomial
+    >>> from wpdc_gwcs.export import make_form
+    >>> cd, crpix, crval = np.diag([-8e-5, 8e-5]), np.array([511.5, 511.5]), np.array([10.0, 45.0])
+    >>> solution = DistortionSolution("d1", (1024, 1024), crpix, cd, crval, PVPolynomial(pv1_7=4.0))
+    >>> form = make_form(solution, "tpv")
+    >>> form.header["PV1_7"], form.tables, form.deviation < 1e-6
+    (4.0, (), True)
     """
 
     form: str

@@ -34,6 +34,19 @@ def own_tables(obj, *, version=1):
     (from one), and ``DX_LUT``, ``DY_LUT`` in px, to be subtracted from the undistorted position.
     The single row of ``WPDC_INSTRUMENT`` has CD0, PV0, the zero-based CRPIX and the nominal CRVAL,
     which are read back without rounding.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import DistortionSolution, LookupTable, PVPolynomial
+    >>> from wpdc_gwcs.export import own_tables
+    >>> cd, crpix, crval = np.diag([-8e-5, 8e-5]), np.array([49.5, 49.5]), np.array([10.0, 45.0])
+    >>> grid = np.linspace(-0.5, 99.5, 5)
+    >>> table = LookupTable(grid, grid, np.full((5, 5), 0.25), np.zeros((5, 5)))
+    >>> solution = DistortionSolution("d1", (100, 100), crpix, cd, crval, PVPolynomial(), table)
+    >>> instrument, lut = own_tables(solution)
+    >>> instrument.name, lut.name, lut.data["X_GRID"][:2].tolist(), float(lut.data["DX_LUT"][0])
+    ('WPDC_INSTRUMENT', 'WPDC_LUT', [0.5, 25.5], 0.25)
     """
     solution = description(obj).solution
     pv, table = solution.pv, obj.lookup_table

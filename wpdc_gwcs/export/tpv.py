@@ -66,6 +66,18 @@ def fold_polynomial(obj):
     -------
     pv : PVPolynomial
         ``PV(U) = A PV0(A^-1 U)``, ``A = CD CD0^-1``; exact.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import Calibration, DistortionSolution, PVPolynomial
+    >>> from wpdc_gwcs.export import fold_polynomial
+    >>> cd, crpix, crval = np.diag([-8e-5, 8e-5]), np.array([511.5, 511.5]), np.array([10.0, 45.0])
+    >>> solution = DistortionSolution("d1", (1024, 1024), crpix, cd, crval, PVPolynomial(pv1_7=4.0))
+    >>> quarter_turn = np.array([[0, -1], [1, 0]]) @ cd
+    >>> pv = fold_polynomial(Calibration("a", solution, crval=crval, cd=quarter_turn))
+    >>> float(pv.pv1_7.value), round(float(pv.pv2_7.value), 9)  # the axes have changed places
+    (0.0, 4.0)
     """
     exact = description(obj)
     nominal = np.asarray(exact.solution.cd)

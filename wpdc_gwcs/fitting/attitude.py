@@ -34,6 +34,19 @@ class AttitudeFit:
         if no errors were given.
     iterations : int
         Number of iterations until CRVAL no longer changed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.fitting import fit_attitude
+    >>> from wpdc_gwcs.models import deproject
+    >>> cd, rng = np.array([[-2e-5, 0.0], [0.0, 2e-5]]), np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 2000, (2, 200))
+    >>> ra, dec = deproject(*(cd @ (x - 1000, y - 1000)), (120.0, 30.0))
+    >>> x, y = [x, y] + rng.normal(0, 0.05, (2, 200))
+    >>> fit = fit_attitude(x, y, ra, dec, crpix=(1000, 1000), crval=(120, 30), cd=cd)
+    >>> float(np.sqrt(fit.covariance[0, 0]).round(4))  # of a_x: 0.05 px / sqrt(200) = 0.0035 px
+    0.0037
     """
 
     crval: np.ndarray

@@ -9,11 +9,22 @@ from wpdc_gwcs.exceptions import FitError
 
 __all__ = ["LinearSolution", "solve_linear"]
 
-# Turns a median absolute deviation into the standard deviation of a normal distribution.
-
 
 class LinearSolution(NamedTuple):
-    """Weighted linear least squares, see `solve_linear`."""
+    """Weighted linear least squares, see `solve_linear`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.fitting import solve_linear
+    >>> x = np.arange(5.0)
+    >>> solution = solve_linear(np.column_stack([np.ones(5), x]), 3 + 2 * x, leverage=True)
+    >>> solution.leverage.round(3).tolist()
+    [0.6, 0.3, 0.2, 0.3, 0.6]
+    >>> covariance = solution.root @ solution.root.T
+    >>> covariance.round(3).tolist()
+    [[0.6, -0.2], [-0.2, 0.1]]
+    """
 
     parameters: np.ndarray
     rank: int

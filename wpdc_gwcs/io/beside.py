@@ -43,6 +43,24 @@ def read_files(paths, **options):
     ------
     FrameError
         As `wpdc_gwcs.io.read_frames` does.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from astropy.io import fits
+    >>> from wpdc_gwcs import simulate
+    >>> from wpdc_gwcs.io import read_files
+    >>> exposure = simulate(1, image_shape=(128, 128), density=60, seed=1).exposures[0]
+    >>> image = exposure.render()
+    >>> image[40:50] = 0.0
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> fits.writeto(folder / "a.fits", image, exposure.header)
+    >>> fits.writeto(folder / "a.mask.fits", (image == 0).astype(np.int16))
+    >>> (frame,) = read_files([folder / "a.fits", folder / "a.mask.fits"])
+    >>> frame.name, int(frame.load_mask().sum())
+    ('a', 1280)
     """
     frames = []
     for path, maps in tell_frames(paths):

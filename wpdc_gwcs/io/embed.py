@@ -37,7 +37,7 @@ from wpdc_gwcs.io.fits import warn_if_far
 from wpdc_gwcs.io.headers import extension_names, find_extension, header_shape, header_value
 from wpdc_gwcs.io.stale import alternates_of, is_stale, tables_of
 
-__all__ = ["INTO_FORMS", "write_into"]
+__all__ = ["INTO_FORMS", "image_numbers", "write_into"]
 
 #: Forms that can be written into an image.
 INTO_FORMS = ("tpv", "sip", "cpdis", "fits", "tab")
@@ -58,18 +58,43 @@ class _Part(NamedTuple):
     name: tuple[str, int]
 
 
-def write_into(
-    obj, image, *, form="tpv", degree=None, output=None, alternates="keep", overwrite=False
-):
-    """Write the WCS of a calibration into an image, atomically.
+def image_numbers(path):
+    """Return the numbers of the HDUs of a file that are images of two axes, without look-up tables.
 
     Parameters
     ----------
-    obj : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
-        The calibration.
+    path : path-like
+        FITS file.
+
+    Returns
+    -------
+    list of int
+        Numbers, from zero.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or not FITS.
+    """
+    path = Path(path)
+    if file_kind(path) != "fits":
+        raise FileFormatError(f"{path}: must be a FITS image")
+    with _named(path):
+        return _images(_read_parts(path))
+
+
+def write_into(
+    obj, image, *, form="tpv", degree=None, output=None, alternates="keep", overwrite=False
+):
+    """Write the WCS of a calibration into an image, or those of several into its extensions.
+
+    Parameters
+    ----------
+    obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or dict
+        The calibration; or the calibration of each extension by its number.
     image : path-like
-        FITS image, ``path[EXT]`` if there are several in the file; also tile-compressed or
-        compressed as a whole.
+        FITS image, ``path[EXT]`` if there are several in the file and `obj` is not a dict; also
+        tile-compressed or compressed as a whole.
     form : {"tpv", "sip", "cpdis", "fits", "tab"}, optional
         See `wpdc_gwcs.export.make_form`.
     degree : int, optional
@@ -84,8 +109,8 @@ def write_into(
 
     Returns
     -------
-    made : `~wpdc_gwcs.export.FitsForm`
-        The written form.
+    made : `~wpdc_gwcs.export.FitsForm` or dict
+        The written form, or that of each extension.
 
     Raises
     ------
@@ -102,10 +127,11 @@ def write_into(
 
     Notes
     -----
-    All terms of the old WCS are removed: CD, PC, CDELT, CROTA, PV, PS, SIP, CPDIS, D2IM, plate
-    solutions, LONPOLE and so on, with the tables that they refer to unless another image of the
-    file needs them.  All other cards, the data, and all other HDUs are copied byte by byte.
-    A CHECKSUM is updated if there was one.  The file is read back before it gets its final name.
+    Either all extensions are written or the file stays as it was.  All terms of the old WCS are
+    removed: CD, PC, CDELT, CROTA, PV, PS, SIP, CPDIS, D2IM, plate solutions, LONPOLE and so on,
+    with the tables that they refer to unless another image of the file needs them.  All other
+    cards, the data, and all other HDUs are copied byte by byte.  A CHECKSUM is updated if there
+    was one.  The file is read back before it gets its final name.
     """
     if form not in INTO_FORMS:
         raise ValueError(f"format must be one of {', '.join(INTO_FORMS)}, got {form!r}")
@@ -124,47 +150,63 @@ def write_into(
         )
     with _named(image):
         parts = _read_parts(path)
-        number = _choose(parts, extension, path)
-        obj = _fit_shape(obj, parts[number].header, image)
-        gone = tables_of(parts[number].header)
+        if isinstance(obj, dict):
+            places = {_choose(parts, number, path): f"{image}[{number}]" for number in obj}
+            objs = dict(zip(places, obj.values(), strict=True))
+        else:
+            places = {_choose(parts, extension, path): str(image)}
+            objs = dict.fromkeys(places, obj)
+        objs = {k: _fit_shape(o, parts[k].header, places[k]) for k, o in objs.items()}
+        gone = set().union(*(tables_of(parts[k].header) for k in objs))
         for other, part in enumerate(parts):
-            if other != number:
+            if other not in objs:
                 gone -= tables_of(part.header)
     # Tables of a WCS are not offered as images, under any name.
     kept = [
-        part
+        k
         for k, part in enumerate(parts)
-        if k in (0, number) or part.name not in gone or not _may_be_table(part)
+        if k == 0 or k in objs or part.name not in gone or not _may_be_table(part)
     ]
-    versions = {}
-    for part in kept:
-        name, version = part.name
-        versions[name] = max(versions.get(name, 1), version + 1)
-    versions["WPDC_LUT"] = max(versions.get(n, 1) for n in ("WPDC_LUT", "WPDC_INSTRUMENT"))
-    made = make_form(obj, form, degree=degree, versions=versions)
-    warn_if_far(made, image)
-    letters, with_sip = alternates_of(parts[number].header)
-    gone_letters = letters if alternates == "remove" else with_sip
+    made = _make_forms(objs, [parts[k] for k in kept], places, form=form, degree=degree)
+    letters = {k: alternates_of(parts[k].header) for k in objs}
     with atomic_path(target, overwrite=overwrite or output is None) as temporary:
         with open_stream(path) as source, open_stream(temporary, "wb", like=path) as copy:
-            for part in kept:
-                if part is parts[number]:
-                    _copy_target(source, copy, part, made, gone_letters, image)
+            for k in kept:
+                if k in made:
+                    every, with_sip = letters[k]
+                    gone_letters = every if alternates == "remove" else with_sip
+                    _copy_target(source, copy, parts[k], made[k], gone_letters, places[k])
                 else:
-                    _copy_bytes(source, copy, part.start, part.end)
-                if part is kept[-1]:
-                    copy.write(_table_bytes(made.tables, parts[number].header))
+                    _copy_bytes(source, copy, parts[k].start, parts[k].end)
+            for k, one in made.items():
+                copy.write(_table_bytes(one.tables, parts[k].header))
             _copy_bytes(source, copy, parts[-1].end, None)
         if output is None:
             _copy_owner(path, temporary)
-        with _named(image):
-            _check(obj, made, temporary, kept.index(parts[number]), image)
-    if alternates == "keep" and with_sip:
-        warnings.warn(
-            f"{image}: alternate WCS {', '.join(sorted(with_sip))} removed: it used the SIP terms "
-            "of the old WCS",
-            WPDCWarning,
-        )
+        _check(objs, made, temporary, {k: kept.index(k) for k in objs}, places, image)
+    for k, (_, with_sip) in letters.items():
+        if alternates == "keep" and with_sip:
+            warnings.warn(
+                f"{places[k]}: alternate WCS {', '.join(sorted(with_sip))} removed: it used the "
+                "SIP terms of the old WCS",
+                WPDCWarning,
+            )
+    return dict(zip(obj, made.values(), strict=True)) if isinstance(obj, dict) else made[k]
+
+
+def _make_forms(objs, parts, places, *, form, degree):
+    """Forms by number; tables of the same name get the versions that are free."""
+    versions = {}
+    for part in parts:
+        name, version = part.name
+        versions[name] = max(versions.get(name, 1), version + 1)
+    made = {}
+    for k, obj in objs.items():
+        versions["WPDC_LUT"] = max(versions.get(n, 1) for n in ("WPDC_LUT", "WPDC_INSTRUMENT"))
+        made[k] = make_form(obj, form, degree=degree, versions=versions)
+        warn_if_far(made[k], places[k])
+        for table in made[k].tables:
+            versions[table.name] = max(versions.get(table.name, 1), table.ver + 1)
     return made
 
 
@@ -217,21 +259,29 @@ def _may_be_table(part):
     return not _is_image(part.header) or part.name[0] in ("WCSDVARR", "D2IMARR")
 
 
+def _images(parts):
+    """Numbers of the images of two axes that are no look-up tables."""
+    return [
+        k
+        for k, part in enumerate(parts)
+        if _is_image(part.header) and not part.name[0].startswith(("WCSDVARR", "D2IMARR"))
+    ]
+
+
 def _choose(parts, extension, path):
     """Return the number of the image that is meant."""
     with open_fits(path, lazy=True) as hdus:
         names = extension_names(hdus)
         number = None if extension is None else find_extension(hdus, extension, path)
-    images = [k for k, part in enumerate(parts) if _is_image(part.header)]
-    own = [k for k in images if not parts[k].name[0].startswith(("WCSDVARR", "D2IMARR"))]
     if number is None:
+        own = _images(parts)
         if len(own) != 1:
             raise InputError(
                 f"{path}: has {len(own)} images of two axes; choose one with path[EXT], "
                 f"EXT one of {names}"
             )
         return own[0]
-    if number not in images:
+    if not _is_image(parts[number].header):
         raise InputError(f"{path}[{extension}]: must be an image of two axes")
     return number
 
@@ -349,21 +399,26 @@ def _table_bytes(tables, header):
     return file.getvalue()[_BLOCK:]
 
 
-def _check(obj, made, path, number, image):
-    """Read the file back: the old WCS must have no effect on it."""
+def _check(objs, made, path, numbers, places, image):
+    """Read the file back: the old WCSs must have no effect on it."""
+    found = {}
     try:
         with open_fits(path) as hdus:
-            header = hdus[number].header.copy()
-            # Without the other images of a mosaic, which are large.
-            wanted = set() if made.form == "fits" else tables_of(header)
-            tables = [h.copy() for h in hdus[1:] if (h.name.upper(), h.ver) in wanted]
+            for k, one in made.items():
+                header = hdus[numbers[k]].header.copy()
+                # Without the other images of a mosaic, which are large.
+                wanted = set() if one.form == "fits" else tables_of(header)
+                tables = [h.copy() for h in hdus[1:] if (h.name.upper(), h.ver) in wanted]
+                found[k] = header, tables
     except InputError as problem:
         reason = str(problem).removeprefix(f"{path}: ")
         raise FileFormatError(f"{image}: no WCS can be written into it: {reason}") from problem
-    found = deviation(obj, astropy_sky(header, tables))
-    expected = made.keywords_deviation if made.form == "fits" else made.deviation
-    if not found <= _READ_BACK * expected + _ROUNDING_PX:
-        raise FileFormatError(
-            f"{image}: other cards of the header interfere with the WCS: it would deviate by "
-            f"{found:.3g} px instead of {expected:.3g} px"
-        )
+    for k, one in made.items():
+        with _named(places[k]):
+            worst = deviation(objs[k], astropy_sky(*found[k]))
+        expected = one.keywords_deviation if one.form == "fits" else one.deviation
+        if not worst <= _READ_BACK * expected + _ROUNDING_PX:
+            raise FileFormatError(
+                f"{places[k]}: other cards of the header interfere with the WCS: it would deviate "
+                f"by {worst:.3g} px instead of {expected:.3g} px"
+            )

@@ -44,6 +44,21 @@ _MAGIC = (
     (b"#ASDF", "asdf"),
     (b"SIMPLE  =", "fits"),
 )
+# Files that are neither FITS, ASDF nor a table, and are given by mistake.
+_FOREIGN = (
+    (b"\xff\xd8\xff", "a JPEG picture"),
+    (b"\x89PNG", "a PNG picture"),
+    (b"GIF8", "a GIF picture"),
+    (b"II*\0", "a TIFF or raw picture"),
+    (b"MM\0*", "a TIFF or raw picture"),
+    (b"%PDF", "a PDF"),
+    (b"PK\x03\x04", "a ZIP archive"),
+    (b"\x1f\x9d", "compressed by compress; decompress it first"),
+)
+# Tables that can be read: HDF5, Parquet, text in UTF-16.
+_TABLES = (b"\x89HDF", b"PAR1", b"\xff\xfe", b"\xfe\xff")
+# No other text begins with control characters other than blanks; headers may be padded with zeros.
+_CONTROL = re.compile(rb".{0,7}\0|.*[\x01-\x08\x0e-\x1f\x7f]", re.DOTALL)
 _FITS_NAME = re.compile(r"\.(fits?|fts|fz)(\.(gz|bz2|xz))?$", re.IGNORECASE)
 _HEADER_NAME = re.compile(r"\.(a?head|hdr|txt)$", re.IGNORECASE)
 _STEM_SUFFIXES = re.compile(
@@ -54,7 +69,23 @@ _UNFIT = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\udc80-\udcff]")
 
 
 class OutputExistsError(InputError, FileExistsError):
-    """An output file exists and may not be replaced."""
+    """An output file exists and may not be replaced.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs import write
+    >>> from wpdc_gwcs.io import OutputExistsError
+    >>> path = f"{tempfile.mkdtemp()}/stars.ecsv"
+    >>> write(Table({"x": [1.0]}), path)
+    >>> write(Table({"x": [2.0]}), path)
+    Traceback (most recent call last):
+        ...
+    wpdc_gwcs.io.files.OutputExistsError: ...stars.ecsv: file exists and is kept; ...
+    >>> issubclass(OutputExistsError, FileExistsError)
+    True
+    """
 
 
 def first_line(error):
@@ -165,6 +196,8 @@ def file_kind(path, *, error=FileFormatError):
         except READ_ERRORS as problem:
             raise error(f"{path}: damaged {kind} file: {first_line(problem)}") from problem
         kind = "fits" if start == b"SIMPLE  =" else "text"
+    if kind == "text" and (what := _foreign(start)) is not None:
+        raise error(f"{path}: must be FITS, ASDF or a table, is {what}")
     if kind == "fits" and (start[80:] in (b"\n", b"\r") or _HEADER_NAME.search(path.name)):
         # A header alone as text: cards in lines, or without line ends if the name says so.
         kind = "text"
@@ -172,6 +205,14 @@ def file_kind(path, *, error=FileFormatError):
         shown = start[:9].decode("latin-1")
         raise error(f"{path}: a FITS file must begin with 'SIMPLE  =', got {shown!r}")
     return kind
+
+
+def _foreign(start):
+    """Tell what a file is that begins so, if it cannot be read; or `None`."""
+    if start.startswith(_TABLES):
+        return None
+    known = next((what for magic, what in _FOREIGN if start.startswith(magic)), None)
+    return known or ("another binary file" if _CONTROL.match(start) else None)
 
 
 @contextlib.contextmanager
@@ -488,6 +529,19 @@ def atomic_path(path, *, overwrite=False):
         If the file exists and may not be replaced, also when it appeared in the meantime.
     InputError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from wpdc_gwcs.io import atomic_path
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> with atomic_path(folder / "notes.txt") as temporary:
+    ...     size = temporary.write_text("all or nothing")
+    ...     print((folder / "notes.txt").exists())
+    False
+    >>> (folder / "notes.txt").read_text()
+    'all or nothing'
     """
     path = Path(path)
     check_output(path, overwrite=overwrite)

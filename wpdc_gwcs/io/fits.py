@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 from astropy.io import fits
 
+from wpdc_gwcs.columns import listed
 from wpdc_gwcs.exceptions import FileFormatError, WPDCWarning
 from wpdc_gwcs.export import (
     INSTRUMENT_NAME,
@@ -255,7 +256,7 @@ def _only(numbers, path):
         raise FileFormatError(f"{path}: must hold a header with CTYPE1, CRVAL1, ...; found none")
     raise FileFormatError(
         f"{path}: has {len(numbers)} WCS headers; choose one with path[N], "
-        f"N one of {', '.join(map(str, numbers[:12]))}"
+        f"N one of {listed([str(n) for n in numbers], kind='headers')}"
     )
 
 

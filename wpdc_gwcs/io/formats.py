@@ -47,9 +47,17 @@ def read(path):
 
     Examples
     --------
+    >>> import tempfile
+    >>> import numpy as np
     >>> import wpdc_gwcs
-    >>> calibration = wpdc_gwcs.read("a.wcs.asdf")  # doctest: +SKIP
-    >>> ra, dec = calibration.wcs(1023.5, 1023.5)  # doctest: +SKIP
+    >>> from wpdc_gwcs import DistortionSolution, PVPolynomial
+    >>> cd, crpix, crval = np.diag([-8e-5, 8e-5]), np.array([511.5, 511.5]), np.array([10.0, 45.0])
+    >>> solution = DistortionSolution("d1", (1024, 1024), crpix, cd, crval, PVPolynomial(pv1_7=4.0))
+    >>> path = f"{tempfile.mkdtemp()}/d1.solution.asdf"
+    >>> wpdc_gwcs.write(solution, path)
+    >>> again = wpdc_gwcs.read(path)
+    >>> again.detector, again.wcs(10.0, 20.0) == solution.wcs(10.0, 20.0)
+    ('d1', True)
     """
     plain, extension = split_extension(path)
     if file_kind(plain) == "asdf":
@@ -168,9 +176,14 @@ def write(obj, path, *, format=None, degree=None, overwrite=False):
 
     Examples
     --------
+    >>> import tempfile
+    >>> import numpy as np
     >>> import wpdc_gwcs
-    >>> calibration = wpdc_gwcs.read("a.wcs.asdf")  # doctest: +SKIP
-    >>> wpdc_gwcs.write(calibration, "a.head")  # doctest: +SKIP
+    >>> from wpdc_gwcs import DistortionSolution, PVPolynomial
+    >>> cd, crpix, crval = np.diag([-8e-5, 8e-5]), np.array([511.5, 511.5]), np.array([10.0, 45.0])
+    >>> solution = DistortionSolution("d1", (1024, 1024), crpix, cd, crval, PVPolynomial(pv1_7=4.0))
+    >>> wpdc_gwcs.write(solution, f"{tempfile.mkdtemp()}/d1.head") < 1e-6  # greatest deviation, px
+    True
     """
     path = Path(path)
     if format is None:

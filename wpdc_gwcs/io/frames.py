@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 from astropy.io import fits
 
+from wpdc_gwcs.columns import listed
 from wpdc_gwcs.exceptions import FrameError, InputError, WPDCWarning
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.io.celestial import parse_wcs
@@ -333,7 +334,7 @@ def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
         if position_columns(names) is None:
             raise FrameError(
                 f"{where}: source list must have positions (x, y; XWIN_IMAGE, YWIN_IMAGE; X_IMAGE, "
-                f"Y_IMAGE; ...), has {', '.join(names[:12])}"
+                f"Y_IMAGE; ...), has {listed(names)}"
             )
     wcs_header = given
     if wcs_header is None:

@@ -42,6 +42,18 @@ class Truth:
         Name of a frame to `~wpdc_gwcs.simulation.FrameTruth`.
     files : dict
         Name of a frame to the path that `wpdc calibrate` reads.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from wpdc_gwcs import simulate
+    >>> from wpdc_gwcs.simulation import read_truth, write_simulation
+    >>> sky = simulate(1, image_shape=(128, 128), density=60, distortion=2, seed=1)
+    >>> folder = tempfile.mkdtemp()
+    >>> files = write_simulation(sky, folder, images=())
+    >>> truth = read_truth(folder)
+    >>> list(truth.frames), truth.stars("sim-01").colnames
+    (['sim-01'], ['x', 'y', 'ra', 'dec', 'magnitude', 'catalog_index', 'source_index'])
     """
 
     folder: Path
@@ -89,6 +101,18 @@ def read_truth(folder):
     ------
     FileFormatError
         If the truth is missing or damaged.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from wpdc_gwcs import simulate
+    >>> from wpdc_gwcs.simulation import read_truth, write_simulation
+    >>> sky = simulate(1, image_shape=(128, 128), density=60, distortion=2, seed=1)
+    >>> folder = tempfile.mkdtemp()
+    >>> files = write_simulation(sky, folder, images=())
+    >>> frame = read_truth(folder).frames["sim-01"]
+    >>> [round(float(d), 6) for d in frame.error_at(sky.exposures[0].sky, 10.0, 20.0)]
+    [0.0, 0.0]
     """
     folder = Path(folder)
     tree, frames = read_truths(folder / TRUTH)
@@ -140,6 +164,16 @@ def write_simulation(
         If a file is there already and ``overwrite`` is not set.
     InputError
         If the folder cannot be written to.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from wpdc_gwcs import simulate
+    >>> from wpdc_gwcs.simulation import write_simulation
+    >>> sky = simulate(2, image_shape=(128, 128), density=60, distortion=2, seed=1)
+    >>> files = write_simulation(sky, tempfile.mkdtemp(), images=(0,))
+    >>> [path.name for path in files["frames"]], files["reference"].name
+    (['sim-01.fits', 'sim-02.cat.ecsv'], 'sim-reference.fits')
     """
     if sources not in ("ecsv", "ldac"):
         raise ValueError(f"sources must be 'ecsv' or 'ldac', not {sources!r}")

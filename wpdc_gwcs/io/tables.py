@@ -9,6 +9,7 @@ import numpy as np
 from astropy.table import Table
 
 from wpdc_gwcs.catalogs import read_table_file
+from wpdc_gwcs.columns import listed
 from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.files import READ_ERRORS, as_utf8, atomic_path, file_kind, first_line
 
@@ -42,6 +43,16 @@ def write_table(table, path, *, overwrite=False):
     -----
     The header is astropy's own; the rows are written here, in less than half the time, every float
     with the digits that bring it back exactly.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from astropy.table import Table
+    >>> from wpdc_gwcs.io import read_table, write_table
+    >>> path = f"{tempfile.mkdtemp()}/stars.ecsv"
+    >>> write_table(Table({"x": [0.1 + 0.2], "used": [True]}), path)
+    >>> bool(read_table(path)["x"][0] == 0.1 + 0.2)  # to the last digit
+    True
     """
     plain = Table(table, copy=False)
     if (
@@ -57,7 +68,7 @@ def write_table(table, path, *, overwrite=False):
 
 
 def read_table(path, *, columns=()):
-    """Read a table that `write_table` wrote, or any other that astropy reads.
+    r"""Read a table that `write_table` wrote, or any other that astropy reads.
 
     Parameters
     ----------
@@ -75,6 +86,20 @@ def read_table(path, *, columns=()):
     ------
     FileFormatError
         If the file is missing, empty or damaged, or lacks a column.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from wpdc_gwcs.io import read_table
+    >>> path = Path(tempfile.mkdtemp()) / "stars.csv"
+    >>> size = path.write_text("x,y\n10.5,20.25\n30,40\n")
+    >>> read_table(path, columns=["x", "y"])["y"].tolist()
+    [20.25, 40.0]
+    >>> read_table(path, columns=["x", "flux"])
+    Traceback (most recent call last):
+        ...
+    wpdc_gwcs.exceptions.FileFormatError: ...stars.csv: table must have a column 'flux', ...
     """
     path = Path(path)
     kind = file_kind(path)
@@ -90,7 +115,7 @@ def read_table(path, *, columns=()):
     for column in columns:
         if column not in table.colnames:
             raise FileFormatError(
-                f"{path}: table must have a column {column!r}, has {', '.join(table.colnames[:12])}"
+                f"{path}: table must have a column {column!r}, has {listed(table.colnames)}"
             )
         if table[column].dtype.kind not in "biuf":
             raise FileFormatError(
@@ -116,6 +141,18 @@ def read_matches(path):
     ------
     FileFormatError
         If the file is missing, empty or damaged, or lacks a column.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from wpdc_gwcs import Settings, calibrate, simulate
+    >>> from wpdc_gwcs.io import read_matches
+    >>> sky = simulate(1, image_shape=(256, 256), density=120, distortion=2, seed=1)
+    >>> frames, folder = [sky.exposures[0].frame()], tempfile.mkdtemp()
+    >>> run = calibrate(frames, sky.reference, settings=Settings(lut="none"), output=folder)
+    >>> matches = read_matches(f"{folder}/sim-01.matches.ecsv")
+    >>> len(matches) == int(run.summary["n_matched"][0]), str(matches["dx"].unit)
+    (True, 'pix')
     """
     return read_table(path, columns=("x", "y", "dx", "dy", "used", "holdout"))
 

@@ -40,6 +40,20 @@ class TableChoice:
         Cross-validated mean square of the normalized residuals; NaN if not measured.
     freedom : float
         Effective number of parameters per axis.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import ResidualMap
+    >>> from wpdc_gwcs.lookup import choose_table
+    >>> x, y = np.random.default_rng(1).uniform(0, 1000, (2, 1500))
+    >>> dx, dy = np.sin(x / 100) + np.random.default_rng(2).normal(0, 0.1, (2, 1500))
+    >>> bins = ResidualMap.from_residuals(
+    ...     x, y, dx, dy, x_err=0.1, y_err=0.1, image_shape=(1000, 1000)
+    ... )
+    >>> choice, candidates = choose_table(bins)
+    >>> choice.kernel, choice.freedom > 10, choice.score <= candidates[-1].score
+    ('gaussian', True, True)
     """
 
     kernel: str

@@ -142,6 +142,20 @@ class TableInfo:
     chi2 : float
         Reduced chi square of the bins about the table, which is near 1 if the errors of the stars
         are correct.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import ResidualMap, build_lookup_table
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 1000, (2, 1500))
+    >>> dx, dy = np.sin(x / 300) + rng.normal(0, 0.05, (2, 1500))
+    >>> bins = ResidualMap.from_residuals(
+    ...     x, y, dx, dy, x_err=0.05, y_err=0.05, image_shape=(1000, 1000)
+    ... )
+    >>> table, info = build_lookup_table(bins, 10)
+    >>> info.choice == info.candidates[0], round(info.chi2), info.sigma.shape
+    (True, 1, (3, 10, 10))
     """
 
     choice: TableChoice

@@ -49,6 +49,17 @@ class MatchDiagnostics:
     search_significance : float
         Significance that takes into account all mappings that the search could have found, with a
         lower limit; NaN if there are too many stars for this to matter.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.matching import match_planes
+    >>> x, y = np.random.default_rng(1).uniform(0, 1000, (2, 200))
+    >>> i, j, found = match_planes(x, y, x + 15, y - 8, image_shape=(1000, 1000))
+    >>> found.n_pairs, [round(v, 6) for v in found.shift], found.purity
+    (200, [15.0, -8.0], 1.0)
+    >>> found.to_dict()["parity"]
+    1
     """
 
     n_sources: int

@@ -76,6 +76,16 @@ class AreaEvidence:
         Whether there are enough stars for a judgment.
     accepted : bool
         Whether the pairs exceed chance and are not far fewer than expected; true where not judged.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.matching import match_planes
+    >>> x, y = np.random.default_rng(1).uniform(0, 1000, (2, 400))
+    >>> i, j, found = match_planes(x, y, x + 15, y - 8, image_shape=(1000, 1000))
+    >>> area = found.areas[0]
+    >>> (area.x, area.y), area.n_pairs == area.n_sources, area.expected_by_chance < 1
+    ((0.0, 0.0), True, True)
     """
 
     x: float

@@ -35,8 +35,8 @@ _LEAST_COUNT = 3
 _CHUNK = 2_000_000
 # Boxes per difference up to which they are counted in an array of all boxes.
 _DENSE = 20
-N_NEIGHBOURS = 12
-MAX_NEIGHBOURS = 160
+N_NEIGHBORS = 12
+MAX_NEIGHBORS = 160
 
 
 def density_ratio_map(xs, ys, xr, yr, image_shape, *, per_cell=40.0):

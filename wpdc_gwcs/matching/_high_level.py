@@ -158,6 +158,20 @@ def pair_table(diagnostics, *, source_index, catalog_index, detector, sky, start
     -------
     `~astropy.table.QTable`
         Columns as described at `match_sources`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.matching import match_planes, pair_table
+    >>> x, y = np.random.default_rng(1).uniform(0, 1000, (2, 200))
+    >>> ra, dec = 10.0 - 1e-4 * x, 1e-4 * y
+    >>> i, j, found = match_planes(x, y, x + 15, y - 8, image_shape=(1000, 1000))
+    >>> pairs = pair_table(
+    ...     found, source_index=i, catalog_index=j, detector=(x[i], y[i]), sky=(ra[j], dec[j]),
+    ...     start=(x[i], y[i]), reference=(x[j] + 15, y[j] - 8),
+    ... )
+    >>> len(pairs), pairs.colnames[:4], round(float(pairs["dx"][0].value), 6)
+    (200, ['source_index', 'catalog_index', 'x', 'y'], -15.0)
     """
     mapped = diagnostics.mapping(*start)
     return QTable(

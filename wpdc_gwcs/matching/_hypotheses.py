@@ -6,8 +6,8 @@ import numpy as np
 
 from wpdc_gwcs.detector import on_detector
 from wpdc_gwcs.matching._features import (
-    MAX_NEIGHBOURS,
-    N_NEIGHBOURS,
+    MAX_NEIGHBORS,
+    N_NEIGHBORS,
     compare_patterns,
     density_ratio_map,
     neighbor_pattern,
@@ -81,7 +81,7 @@ def find_seeds(problem):
             seeds = []
             for turn in turns:
                 sources = Stars.build(problem.turned(turn)[rows_s])
-                n_near, _ = count_neighbors(problem, sources, reference, N_NEIGHBOURS)
+                n_near, _ = count_neighbors(problem, sources, reference, N_NEIGHBORS)
                 hypotheses, groups = find_groups(
                     problem,
                     sources,
@@ -132,7 +132,7 @@ def count_neighbors(problem, sources, reference, n_neighbors):
     ratio, _, _ = density_ratio_map(*sources.points.T, *reference.points.T, problem.shape)
     many, few = np.quantile(ratio, [0.75, 0.25])
     return tuple(
-        int(min(MAX_NEIGHBOURS, np.ceil(n_neighbors * max(1.0, surplus))))
+        int(min(MAX_NEIGHBORS, np.ceil(n_neighbors * max(1.0, surplus))))
         for surplus in (many, 1 / few)
     )
 
@@ -204,10 +204,10 @@ def first_pairs(sources, reference, hypotheses, n_neighbors):
         agreeing = _agreeing_pairs(sources.points, reference.points, pairs)
         if agreeing is not None:
             yield agreeing
-    if len(hypotheses) > 1 or n_neighbors > N_NEIGHBOURS:
+    if len(hypotheses) > 1 or n_neighbors > N_NEIGHBORS:
         alone = _neighbor_pairs(sources, reference, hypotheses.take(slice(0, 1)), n_neighbors)
         yield alone
-        if n_neighbors > N_NEIGHBOURS:
+        if n_neighbors > N_NEIGHBORS:
             # most neighbors are missing in the other list: many coincidences are by chance
             agreeing = _agreeing_pairs(sources.points, reference.points, alone)
             if agreeing is not None:

@@ -8,7 +8,7 @@ from wpdc_gwcs.robust import plane_scatter
 
 __all__ = ["LocalCorrection"]
 
-N_NEIGHBOURS = 24
+N_NEIGHBORS = 24
 # The correction must reduce the scatter of left-out pairs to this fraction, or it is noise.
 _WORTHWHILE = 0.97
 _BLOCK = 32768
@@ -36,7 +36,7 @@ class LocalCorrection:
 
         Outliers are no problem: pairs are within a few standard deviations of the mapping.
         """
-        if len(points) < 4 * N_NEIGHBOURS:
+        if len(points) < 4 * N_NEIGHBORS:
             return None
         before = plane_scatter(*residual.T)
         correction = cls(points, residual)
@@ -64,7 +64,7 @@ class LocalCorrection:
         leverage = np.zeros(len(positions))
         for start in range(0, len(positions), _BLOCK):
             part = slice(start, start + _BLOCK)
-            _, near = find_nearest(self.tree, positions[part], N_NEIGHBOURS + leave_out)
+            _, near = find_nearest(self.tree, positions[part], N_NEIGHBORS + leave_out)
             near = near[:, 1:] if leave_out else near
             step = self.points[near] - positions[part][:, None, :]
             x, y = step[..., 0], step[..., 1]
@@ -72,8 +72,8 @@ class LocalCorrection:
             sxx, sxy, syy = (x * x).sum(1), (x * y).sum(1), (y * y).sum(1)
             # first column of the inverse of the normal matrix of a + b x + c y
             a, b, c = sxx * syy - sxy**2, sxy * sy - sx * syy, sx * sxy - sxx * sy
-            determinant = N_NEIGHBOURS * a + sx * b + sy * c
-            good = determinant > 1e-6 * N_NEIGHBOURS * sxx * syy
+            determinant = N_NEIGHBORS * a + sx * b + sy * c
+            good = determinant > 1e-6 * N_NEIGHBORS * sxx * syy
             scale = np.where(good, 1 / np.where(good, determinant, 1), 0)
             weight = (a[:, None] + b[:, None] * x + c[:, None] * y) * scale[:, None]
             correction[part] = (weight[..., None] * self.residual[near]).sum(1)

@@ -97,6 +97,17 @@ def match_nearby(
     the given bounds.  With n pairs found where chance gives :math:`\lambda` of the radius r, the
     evidence is the Poisson tail :math:`P(\ge n)` times the number of mappings that the search has
     tried, at most :math:`(1 + s/r)^2 (1 + b/r)^4` for the shift s and the bend b allowed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.matching import match_nearby
+    >>> x, y = np.random.default_rng(1).uniform(0, 1000, (2, 12))
+    >>> i, j, linear, found = match_nearby(
+    ...     x, y, x + 5, y - 3, image_shape=(1000, 1000), max_shift=20, max_bend=2
+    ... )
+    >>> len(i), linear[0].round(6).tolist()
+    (12, [5.0, -3.0])
     """
     began = time.perf_counter()
     local = np.column_stack([xs, ys]), np.column_stack([xr, yr])

@@ -37,6 +37,17 @@ class MatchOptions:
     ------
     ValueError
         If a value is out of its range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.matching import MatchOptions, match_planes
+    >>> MatchOptions().max_rotation
+    3.0
+    >>> x, y = np.random.default_rng(1).uniform(0, 1000, (2, 200))
+    >>> i, j, found = match_planes(x, y, 1000 - x, y, image_shape=(1000, 1000), blind=True)
+    >>> found.n_pairs, found.parity  # mirrored
+    (200, -1)
     """
 
     blind: bool = False

@@ -232,6 +232,17 @@ class DistortionInverse(Model):
         The model to invert.
     **kwargs
         ``name`` and ``meta`` of the model.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import DistortionCorrection, PVPolynomial
+    >>> pv = PVPolynomial(pv1_0=2e-4)
+    >>> correct = DistortionCorrection((49.5, 49.5), [[-1e-4, 0], [0, 1e-4]], pv)
+    >>> type(correct.inverse).__name__
+    'DistortionInverse'
+    >>> x, y = correct.inverse([8.0, 18.0], [20.0, 20.0])
+    >>> x.round(9).tolist(), y.round(9).tolist()
+    ([10.0, 20.0], [20.0, 20.0])
     """
 
     n_inputs = 2
@@ -283,6 +294,16 @@ class DetectorToSky(Model):
         Undistorted pixels to the sky.
     **kwargs
         ``name`` and ``meta`` of the model.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, PVPolynomial, TangentSky
+    >>> cd = [[-1e-4, 0], [0, 1e-4]]
+    >>> correct = DistortionCorrection((49.5, 49.5), cd, PVPolynomial(pv1_0=2e-4))
+    >>> sky = TangentSky((49.5, 49.5), cd, (10.0, 20.0))
+    >>> one, two = DetectorToSky(correct, sky)(10.0, 20.0), (correct | sky)(10.0, 20.0)
+    >>> bool(abs(one[0] - two[0]) < 1e-11), bool(abs(one[1] - two[1]) < 1e-11)
+    (True, True)
     """
 
     n_inputs = 2
@@ -368,6 +389,18 @@ class SkyToDetector(Model):
         Undistorted pixels to the sky.
     **kwargs
         ``name`` and ``meta`` of the model.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import DetectorToSky, DistortionCorrection, PVPolynomial, TangentSky
+    >>> cd = [[-1e-4, 0], [0, 1e-4]]
+    >>> correct = DistortionCorrection((49.5, 49.5), cd, PVPolynomial(pv1_0=2e-4))
+    >>> model = DetectorToSky(correct, TangentSky((49.5, 49.5), cd, (10.0, 20.0)))
+    >>> type(model.inverse).__name__
+    'SkyToDetector'
+    >>> x, y = model.inverse(*model(10.0, 20.0))
+    >>> round(float(x), 6), round(float(y), 6)
+    (10.0, 20.0)
     """
 
     n_inputs = 2

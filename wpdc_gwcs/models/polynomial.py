@@ -261,6 +261,16 @@ class PVInverse(Model):
         The polynomial to invert.
     **kwargs
         ``name`` and ``meta`` of the model.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import PVPolynomial
+    >>> inverse = PVPolynomial(pv1_7=0.5).inverse
+    >>> type(inverse).__name__
+    'PVInverse'
+    >>> xi, eta = inverse([0.1005, -0.2], [0.0, 0.0])
+    >>> xi.round(6).tolist()
+    [0.1, -0.196222]
     """
 
     n_inputs = 2

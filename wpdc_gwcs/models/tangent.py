@@ -333,6 +333,16 @@ class SkyTangent(_Linear):
         Right ascension and declination of the tangent point in degrees.
     **kwargs
         ``name`` and ``meta`` of the model.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import TangentSky
+    >>> sky = TangentSky(crpix=(99.5, 99.5), cd=[[-1e-4, 0], [0, 1e-4]], crval=(0.0, 60.0))
+    >>> type(sky.inverse).__name__
+    'SkyTangent'
+    >>> x, y = sky.inverse([0.0, 180.0], [60.01, -60.0])  # the second one is behind the observer
+    >>> x.round(4).tolist(), y.round(4).tolist()
+    ([99.5, nan], [199.5, nan])
     """
 
     _to_sky = False
@@ -379,6 +389,14 @@ def local_plane(sky, x, y, *, step=1.0):
         RA and Dec of the pixel, deg.
     cd : (2, 2) ndarray
         Derivatives of the standard coordinates about it with respect to x and y, deg / px.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import TangentSky, local_plane
+    >>> sky = TangentSky(crpix=(99.5, 99.5), cd=[[-1e-4, 0], [0, 1e-4]], crval=(10.0, 60.0))
+    >>> crval, cd = local_plane(sky, 99.5, 99.5)
+    >>> crval.round(9).tolist(), (1e4 * cd).round(6).tolist()
+    ([10.0, 60.0], [[-1.0, 0.0], [0.0, 1.0]])
     """
     at = (
         x + step * np.array([0.0, 1.0, -1.0, 0.0, 0.0]),

@@ -20,6 +20,14 @@ class PVTerms(NamedTuple):
     Term ``k`` of axis ``i`` is ``PVi_{index[k]} * a**own[k] * b**other[k] * r**radius[k]``, where
     ``a`` is the coordinate of axis ``i`` itself (xi for axis 1, eta for axis 2), ``b`` that of the
     other axis and ``r = hypot(xi, eta)``.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.models import pv_terms
+    >>> terms = pv_terms(3)
+    >>> k = terms.index.tolist().index(8)
+    >>> int(terms.own[k]), int(terms.other[k])  # PV1_8 is the coefficient of xi^2 eta
+    (2, 1)
     """
 
     index: np.ndarray

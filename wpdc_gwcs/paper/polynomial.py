@@ -33,6 +33,23 @@ class ExposurePolynomial:
         Covariance of its coefficients, first those of x, then those of y.
     steps : int
         Number of damped steps.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import RadialWeight
+    >>> from wpdc_gwcs.models import deproject
+    >>> from wpdc_gwcs.paper import fit_exposure
+    >>> from wpdc_gwcs.solve import Exposure
+    >>> x, y = np.random.default_rng(1).uniform(0, 999, (2, 500))
+    >>> cd = np.diag([-1e-4, 1e-4])
+    >>> sky = deproject(*(cd @ [x - 500 + 1.024, y - 500]), (10.0, 20.0))
+    >>> exposure = Exposure("a", x, y, *sky, crval=(10.0, 20.0), cd=cd)
+    >>> fit = fit_exposure(exposure, (500.0, 500.0), weight=RadialWeight("w1", r0=435))
+    >>> round(float(fit.pv.pv1_0.value / cd[0, 0]), 3)  # of the 1.024 px that were put in
+    1.023
+    >>> fit.correct(100.0, 200.0)[0].round(3)
+    array([101.023, 200.   ])
     """
 
     exposure: Exposure

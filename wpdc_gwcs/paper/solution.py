@@ -80,6 +80,25 @@ def solve_literally(
     References
     ----------
     WPDC-2P, arXiv:2603.09193, sections 3.2 and 3.3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import RadialWeight
+    >>> from wpdc_gwcs.models import deproject
+    >>> from wpdc_gwcs.paper import solve_literally
+    >>> from wpdc_gwcs.solve import Exposure
+    >>> x, y = np.random.default_rng(1).uniform(0, 999, (2, 500))
+    >>> cd = np.diag([-1e-4, 1e-4])
+    >>> u, v = (x - 500) / 500, (y - 500) / 500
+    >>> sky = deproject(*(cd @ [x - 500 + 3 * u * (u**2 + v**2), y - 500]), (10.0, 20.0))
+    >>> exposure = Exposure("a", x, y, *sky, crval=(10.0, 20.0), cd=cd, detector="d1")
+    >>> result, _ = solve_literally(
+    ...     [exposure], [(500.0, 500.0)], image_shape={"d1": (1000, 1000)},
+    ...     weight={"d1": RadialWeight("w1", r0=435)},
+    ... )
+    >>> result.exposures[0].pv.degree, len(result.solutions["d1"].lookup_table.x_grid)
+    (3, 50)
     """
     if lut not in ("auto", "none"):
         raise ValueError(f"lut must be 'auto' or 'none', got {lut!r}")

@@ -73,6 +73,16 @@ def reproduce(parts, folder, *, scale=FULL, seed=SEED, jobs=1, overwrite=False, 
     ------
     InputError
         If there is no such part, or the folder cannot be written to.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.reproduction import PARTS, reproduce
+    >>> list(PARTS)
+    ['detectors', 'cluster', 'bass', 'weights', 'centroids']
+    >>> reproduce(["figure 3"], "paper")
+    Traceback (most recent call last):
+        ...
+    wpdc_gwcs.exceptions.InputError: part must be one of detectors, cluster, bass, ...
     """
     for part in parts:
         if part not in PARTS:

@@ -83,6 +83,12 @@ def reproduce_centroids(folder, scale, *, seed=SEED, jobs=1, progress=None):
     Notes
     -----
     Writes ``centroids.png``.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.reproduction import CLAIMS
+    >>> [(c.item, c.value) for c in CLAIMS if c.part == "centroids" and c.quantity == "sigma_dx"]
+    [('g < 20', 0.02), ('g = 25', 0.07)]
     """
     options = {"density": 60.0, "galaxies": 10.0, **scale.images}
     simulation = simulate(

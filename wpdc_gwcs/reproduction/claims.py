@@ -21,6 +21,14 @@ class Claim:
         The number.
     source : str
         Table, figure or section.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.reproduction import CLAIMS
+    >>> [claim.value for claim in CLAIMS if claim.part == "weights"]
+    [0.6]
+    >>> CLAIMS[-1].item, CLAIMS[-1].quantity, CLAIMS[-1].unit, CLAIMS[-1].source
+    ('scamp', 'sigma_delta', 'mas', 'figure 10, section 4.2')
     """
 
     part: str

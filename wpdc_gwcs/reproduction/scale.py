@@ -47,6 +47,16 @@ class Scale:
         Number of images for centroids, and of images of the cluster.
     images : dict
         Options of the camera ``csst-msc`` and of its field for images; empty for its full size.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> from wpdc_gwcs.reproduction import FULL, QUICK
+    >>> FULL.n_fields, QUICK.n_fields
+    (25, 4)
+    >>> one = replace(QUICK, detectors=("g-1",), n_fields=1)
+    >>> len(one.fields(seed=1)["center"])
+    1
     """
 
     detectors: tuple[str, ...] = DETECTORS

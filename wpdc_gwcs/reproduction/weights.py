@@ -58,6 +58,12 @@ def reproduce_weights(folder, scale, *, seed=SEED, jobs=1, progress=None):
     Residuals are those of the polynomial alone.  ``ours`` fits one polynomial to all exposures,
     ``literal`` one to each exposure.  Writes ``weights.png``, ``weights-central.png``,
     ``slices.png`` and ``weights.ecsv``, which also has the residuals with tables.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.reproduction import CLAIMS
+    >>> [(c.item, c.quantity, c.value) for c in CLAIMS if c.part == "weights"]
+    [('w1', 'share_within_0p1', 0.6)]
     """
     simulation = simulate_fields(_DETECTOR, scale, seed=seed)
     run = calibrate_fields(simulation, scale, jobs=jobs)

@@ -34,6 +34,19 @@ class SimulatedDetector:
     depth : float, optional
         Magnitudes by which the detector is deeper than the camera's ``magnitudes``; negative if it
         is shallower.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from wpdc_gwcs.simulation import Distortion, SimulatedCamera, SimulatedDetector
+    >>> distortion = Distortion.random((500, 1000), amplitude=5.0, rng=1)
+    >>> detectors = (
+    ...     SimulatedDetector("left", distortion, center=(-520.0, 0.0)),
+    ...     SimulatedDetector("right", distortion.scaled(-1.0), center=(520.0, 0.0)),
+    ... )
+    >>> camera = SimulatedCamera("two", detectors, 0.3 * u.arcsec)
+    >>> [(detector.name, detector.image_shape) for detector in camera.detectors]
+    [('left', (500, 1000)), ('right', (500, 1000))]
     """
 
     name: str
@@ -94,6 +107,16 @@ class SimulatedCamera:
     See Also
     --------
     make_camera : Make one of the built-in cameras.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.simulation import make_camera
+    >>> camera = make_camera("csst-msc", seed=3)
+    >>> len(camera.detectors), len(camera.only(["g-1", "g-2"]).detectors)
+    (18, 2)
+    >>> g1 = camera.only(["g-1"]).detectors[0]
+    >>> round(float(camera.flux(20.0, g1) / camera.flux(21.0, g1)), 3)  # one magnitude
+    2.512
     """
 
     name: str

@@ -44,6 +44,17 @@ class Distortion:
     where :math:`T_1` is the constant and linear part of the radial term at the center, which is in
     the linear WCS.  The inverse is Newton's iteration with the Wirtinger derivatives
     :math:`D_z, D_{\bar z}`.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.simulation import Distortion
+    >>> distortion = Distortion.random((1000, 1000), amplitude=40.0, rng=1)
+    >>> round(distortion.greatest(), 3), round(distortion.scaled(0.1).greatest(), 3)
+    (40.0, 4.0)
+    >>> u, v = distortion.undistort(10.0, 20.0)
+    >>> x, y = distortion.distort(u, v)
+    >>> round(float(x), 6), round(float(y), 6)
+    (10.0, 20.0)
     """
 
     image_shape: tuple[int, int]

@@ -49,6 +49,15 @@ class SimulatedExposure(FrameTruth):
     header : `astropy.io.fits.Header`
         The header a camera would write: nominal TAN WCS (wrong by pointing, roll, scale and all
         of the distortion), ``DATE-OBS``, ``GAIN``, ``SATURATE``, ...
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import simulate
+    >>> exposure = simulate(1, image_shape=(128, 128), density=60, seed=1).exposures[0]
+    >>> exposure.render().shape, exposure.header["OBJECT"]
+    ((128, 128), 'sim-01')
+    >>> len(exposure.stars) >= len(exposure.sources) > 0
+    True
     """
 
     header: fits.Header

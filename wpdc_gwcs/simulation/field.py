@@ -43,6 +43,17 @@ class Simulation:
         The camera.
     settings : dict
         The options of `simulate`.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import simulate
+    >>> sky = simulate(2, image_shape=(128, 128), density=60, seed=1)
+    >>> [exposure.name for exposure in sky.exposures]
+    ['sim-01', 'sim-02']
+    >>> sky.camera.name, sky.settings["density"]
+    ('sim', 60)
+    >>> sky.reference["ref_epoch"].unit
+    Unit("yr")
     """
 
     reference: QTable

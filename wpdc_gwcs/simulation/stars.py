@@ -43,6 +43,17 @@ class KingCluster:
     References
     ----------
     King, I. 1962, AJ 67, 471.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from wpdc_gwcs import simulate
+    >>> from wpdc_gwcs.simulation import KingCluster
+    >>> cluster = KingCluster(density=2000, core_radius=5 * u.arcsec, tidal_radius=30 * u.arcsec)
+    >>> field = simulate(1, image_shape=(256, 256), density=30, seed=1)
+    >>> crowded = simulate(1, image_shape=(256, 256), density=30, cluster=cluster, seed=1)
+    >>> len(crowded.reference) > len(field.reference)
+    True
     """
 
     density: float

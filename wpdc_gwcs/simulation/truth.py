@@ -31,6 +31,18 @@ class FrameTruth:
         The true WCS of undistorted pixels.
     color : float, optional
         Color that the map is for, if positions depend on color.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs import simulate
+    >>> truth = simulate(1, image_shape=(256, 256), distortion=5, seed=1).exposures[0]
+    >>> x, y = truth.pixel(*truth.sky(10.0, 20.0))
+    >>> round(float(x), 6), round(float(y), 6)
+    (10.0, 20.0)
+    >>> dx, dy = truth.error_at(truth.linear_wcs, 0.0, 0.0)  # the distortion is missing
+    >>> float(np.hypot(dx, dy)) > 1
+    True
     """
 
     name: str

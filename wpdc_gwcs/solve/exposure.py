@@ -41,6 +41,17 @@ class Exposure:
         Name of the detector.
     exposure : hashable, optional
         Identifier that the frames of one exposure of a mosaic share.  Default: none is shared.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.solve import Exposure
+    >>> exposure = Exposure(
+    ...     "night-07", x=[10, 20], y=[5, 6], ra=[120.0, 120.1], dec=[30.0, 30.1], crval=(120, 30),
+    ...     cd=np.diag([-2e-5, 2e-5]), detector="d1",
+    ... )
+    >>> exposure.name, len(exposure.x), exposure.x_err is None  # errors from the residuals
+    ('night-07', 2, True)
     """
 
     name: str
@@ -97,6 +108,20 @@ class ExposureFit:
         Why the exposure was left out; its numbers are then the starting values.
     statistics : dict
         Counts and scatter of the pairs used, px.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.models import deproject
+    >>> from wpdc_gwcs.solve import Exposure, solve
+    >>> cd, rng = np.diag([-2e-5, 2e-5]), np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 999, (2, 300))
+    >>> sky = deproject(*(cd @ [x - 499.5, y - 499.5]), (120.0, 30.0))
+    >>> x[0] += 5.0  # a wrong pair
+    >>> exposure = Exposure("a", x, y, *sky, crval=(120, 30), cd=cd)
+    >>> fit = solve([exposure], image_shape=(1000, 1000), lut="none").exposures[0]
+    >>> fit.used[:3].tolist(), (fit.dx[:3].round(2) + 0.0).tolist()
+    ([False, True, True], [5.0, 0.0, 0.0])
     """
 
     name: str
@@ -136,6 +161,19 @@ class SolveResult:
         `TableInfo` of each detector, by name; no entry without a table.
     reference_color : float or None
         Color that the solution is for; `None` if no colors were given.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.models import deproject
+    >>> from wpdc_gwcs.solve import Exposure, solve
+    >>> cd, rng = np.diag([-2e-5, 2e-5]), np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 999, (2, 300))
+    >>> sky = deproject(*(cd @ [x - 499.5, y - 499.5]), (120.0, 30.0))
+    >>> exposure = Exposure("a", x, y, *sky, crval=(120, 30), cd=cd, detector="d1")
+    >>> result = solve([exposure], image_shape=(1000, 1000), lut="none")
+    >>> list(result.solutions), [fit.name for fit in result.exposures], result.rejected
+    (['d1'], ['a'], {})
     """
 
     solutions: dict

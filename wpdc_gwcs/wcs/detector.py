@@ -37,6 +37,15 @@ class DetectorWCS(WCS):
     - The two steps and the bounding box are evaluated in one pass.
 
     Everything else, including the parameters, is as in the base class.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs import build_wcs
+    >>> cd = [[-1e-3, 0], [0, 1e-3]]
+    >>> wcs = build_wcs(crpix=(511.5, 511.5), cd=cd, crval=(0, 89.9), image_shape=(1024, 1024))
+    >>> x, y = wcs.invert(123.0, 90.0)  # the pole is on the detector
+    >>> round(float(x), 3), round(float(y), 3)
+    (511.5, 611.5)
     """
 
     def _models(self):

@@ -124,6 +124,14 @@ def stock_polynomial(coefficients):
     -------
     `~astropy.modeling.models.Polynomial2D`
         Polynomial of total degree n - 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from wpdc_gwcs.wcs import stock_polynomial
+    >>> model = stock_polynomial(np.array([[1.0, 3.0], [2.0, 0.0]]))  # 1 + 2 x + 3 y
+    >>> model(10.0, 100.0)
+    321.0
     """
     n = len(coefficients)
     terms = {f"c{p}_{q}": coefficients[p, q] for p in range(n) for q in range(n - p)}
