@@ -248,6 +248,16 @@ class TestRich:
         assert result.solutions["a"] is stored["a"]
         assert self.rms(camera, result) < 0.03
 
+    def test_a_stored_solution_that_does_not_hold(self, camera):
+        """Its frames are left out, for a reason that those of the other detectors would not get."""
+        stored = solve(camera.frames, image_shape=SHAPE).solutions
+        curved = stored["b"].pv.copy()
+        curved.pv1_4 = curved.pv1_4 + 100.0
+        changed = stored | {"b": replace(stored["b"], pv=curved)}
+        result = solve(camera.frames, image_shape=SHAPE, solution=changed)
+        assert set(result.rejected) == {"b0", "b1", "b2"}
+        assert all("a stored solution that does not hold" in r for r in result.rejected.values())
+
     def test_wrong_pairs_of_one_frame(self, camera, rng):
         """It is left out, and the eight others are as good as ever."""
         frames, order = list(camera.frames), rng.permutation(150)

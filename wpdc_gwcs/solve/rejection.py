@@ -8,6 +8,7 @@ import numpy as np
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.solve.errors import worse_scatter
 from wpdc_gwcs.solve.state import all_residuals
+from wpdc_gwcs.solve.stored import StoredMap
 
 __all__ = ["without_aliens", "without_wrong"]
 
@@ -67,7 +68,7 @@ def without_aliens(o, state):
         if len(scatter) > 2 and value > max(_ALIEN_RATIO * typical, _ALIEN_SCATTER):
             reasons[f] = (
                 f"its residuals scatter by {value:.3g} px, those of the others by "
-                f"{typical:.3g} px: wrong pairs or bad positions"
+                f"{typical:.3g} px: {_causes(o, state, f)}"
             )
     return _left_out(o, state, reasons)
 
@@ -104,15 +105,20 @@ def without_wrong(o, state):
         if f not in scatter:
             reasons[f] = "none of its pairs can be used"
         elif scatter[f] > _MAX_SCATTER:
-            reasons[f] = (
-                f"its residuals scatter by {scatter[f]:.3g} px: wrong pairs or bad positions"
-            )
+            reasons[f] = f"its residuals scatter by {scatter[f]:.3g} px: {_causes(o, state, f)}"
         elif len(scatter) > 2 and scatter[f] > max(_REJECT_RATIO * typical, 0.1):
             reasons[f] = (
                 f"its residuals scatter by {scatter[f]:.3g} px, those of the others by "
-                f"{typical:.3g} px: wrong pairs or bad positions"
+                f"{typical:.3g} px: {_causes(o, state, f)}"
             )
     return _left_out(o, state, reasons)
+
+
+def _causes(o, state, f):
+    """Name what may make the residuals of a frame large."""
+    if isinstance(state.model.tables[o.detector_of[f]], StoredMap):
+        return "wrong pairs, bad positions, or a stored solution that does not hold"
+    return "wrong pairs or bad positions"
 
 
 def _left_out(o, state, reasons):
