@@ -15,7 +15,7 @@ from wpdc_gwcs.solve.model import block, colored, undistorted
 from wpdc_gwcs.solve.state import predict_variance
 from wpdc_gwcs.solve.waves import count_places
 
-__all__ = ["N_SIGMA", "inherited", "represent_detector", "represent_frame", "split_linear"]
+__all__ = ["N_SIGMA", "represent_detector", "represent_frame", "split_linear", "unknown_errors"]
 
 # Points along each axis: for the fit of the attitude, and for the uncertainty of a frame.
 N_SIGMA = 17
@@ -51,7 +51,7 @@ def represent_detector(
     table_sigma : (3, n, n) ndarray, optional
         Uncertainty of the smoothed table.
     factor : float, optional
-        As from `inherited`.
+        As from `unknown_errors`.
 
     Returns
     -------
@@ -131,7 +131,7 @@ def _growth(o, state, k, x, y):
     return extrapolation(np.array(stars), np.array(detector.normalized(x, y)))
 
 
-def inherited(o, state, k):
+def unknown_errors(o, state, k):
     """Return the factor for the errors of a distortion due to what its terms do not know.
 
     These are errors of reference stars that exposures share, and degrees beyond the last one.
@@ -148,11 +148,11 @@ def inherited(o, state, k):
     behind = _behind(o, state, k)
     variance = np.mean(state.sigma[:, behind] ** 2, axis=0)
     factor = np.sqrt(repetition(o.star[behind], variance, o.reference[behind]))
-    if "polynomial" in state.model.sigma:
-        detector = o.detectors[k]
-        side = max(detector.image_shape)
-        n_places = count_places(np.array([o.x[behind], o.y[behind]]) / side)
-        factor *= truncation(state.model.sigma["polynomial"], n_places)
+    side = max(o.detectors[k].image_shape)
+    n_places = count_places(np.array([o.x[behind], o.y[behind]]) / side)
+    for term in state.model.scoped("detector"):
+        if term.decay:
+            factor *= truncation(state.model.sigma[term.name], n_places)
     return factor
 
 
@@ -187,7 +187,7 @@ def represent_frame(o, state, f, solution, *, n_grid, table_sigma, places, facto
         Undistorted positions of grids, and factors by the distance to the stars, which all frames
         of a detector share.
     factor : float, optional
-        As from `inherited`.
+        As from `unknown_errors`.
 
     Returns
     -------

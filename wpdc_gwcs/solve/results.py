@@ -9,9 +9,9 @@ from wpdc_gwcs.solve.own_polynomial import own_polynomial
 from wpdc_gwcs.solve.represent import (
     delivered_residual,
     frame_fit,
-    inherited,
     represent_detector,
     represent_frame,
+    unknown_errors,
 )
 from wpdc_gwcs.solve.state import all_residuals
 from wpdc_gwcs.solve.strength import summarize_fields
@@ -51,7 +51,7 @@ def frozen_result(o, state, stored, infos, group, settings, cd, update):
     n_grid, lut, refine, degree = (settings[k] for k in ("n_grid", "lut", "refine", "degree"))
     pv_degree = settings["pv_degree"]
     solutions = {}
-    factors = [inherited(o, state, k) for k in range(len(o.detectors))]
+    factors = [unknown_errors(o, state, k) for k in range(len(o.detectors))]
     tables = [
         _table_sigma(info, stored.get(d.name), factor)
         for d, info, factor in zip(o.detectors, infos, factors)
