@@ -10,8 +10,10 @@ from wpdc_gwcs import plotting
 __all__ = ["detector_figures", "frame_figures"]
 
 # Dots per inch and colors of figures, which have few and their shades, and stars that are drawn one
-# by one: of a detector, and of what there may be many of.
+# by one: of a detector, of its color maps, in which fewer shades would show false hues, and of what
+# there may be many of.
 _LARGE = {"dpi": 80, "colors": 64}
+_MAPS = {"dpi": 80, "colors": 256}
 _SMALL = {"dpi": 62, "colors": 16}
 _MOST_STARS, _MOST_STARS_SMALL = 4000, 700
 
@@ -83,6 +85,7 @@ def detector_figures(name, solution, table, *, small=False):
                 plotting.plot_lookup_table(solution.lookup_table),
                 f"look-up table of {name}",
                 "The look-up table.",
+                **_MAPS,
             )
         )
     return figures
