@@ -27,7 +27,7 @@ setup(
             ["wpdc_gwcs/kernels/_compiled.c"],
             depends=[
                 f"wpdc_gwcs/kernels/{name}.h"
-                for name in ("angles", "common", "inverse", "plane", "sky", "stars")
+                for name in ("angles", "common", "inverse", "levels", "plane", "sky", "stars")
             ],
             py_limited_api=True,
             # Without a compiler the package installs all the same and computes in NumPy.

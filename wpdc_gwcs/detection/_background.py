@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import sep
 
+from wpdc_gwcs.detection._levels import measure_levels
 from wpdc_gwcs.detection._mosaic import has_pattern, plane_slices, star_responses
 from wpdc_gwcs.detection._strips import row_strips
 from wpdc_gwcs.exceptions import DetectionError
@@ -209,7 +209,7 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
     Notes
     -----
     The background is the mode of every cell after clipping (Bertin & Arnouts 1996, A&AS 117, 393),
-    median filtered and interpolated by bicubic splines with `sep`.  The raw mosaic of a color
+    median filtered and interpolated by bicubic splines.  The raw mosaic of a color
     camera is recognized by a pattern of 2 x 2 px.  It has a background for each of the four planes,
     which are scaled to the same response to stars.
 
@@ -259,23 +259,20 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
     relative = None if weight is None else _relative_noise(np.asarray(weight), bad)
     planes = plane_slices(period)
     rms = np.empty(image.shape, dtype=np.float32) if period > 1 else None
-    levels = []
+    level = []
     for plane in planes:
         part = np.ascontiguousarray(image[plane])
         hidden = None if bad is None else np.ascontiguousarray(bad[plane])
-        cells = {
-            "mask": hidden,
-            "bh": min(mesh // period, part.shape[0]),
-            "bw": min(mesh // period, part.shape[1]),
-            "fh": filter_size,
-            "fw": filter_size,
-        }
-        estimate = sep.Background(part, **cells)
-        estimate.subfrom(part)
-        levels.append(estimate.globalback)
+        cells = max(4, mesh // period), filter_size, scale / unit
+        levels, hidden = measure_levels(part, hidden, *cells)
+        if hidden is not None:
+            bad = np.zeros(image.shape, bool) if bad is None else bad.copy()
+            bad[plane] = hidden
+        levels.subtract(part)
+        level.append(np.median(levels.level))
         if relative is not None:
-            estimate = sep.Background(part / relative[plane], **cells)
-        noise = estimate.rms(dtype=np.float32)
+            levels, _ = measure_levels(part / relative[plane], hidden, *cells)
+        noise = levels.noise()
         if relative is not None:
             noise *= relative[plane]
         if period == 1:
@@ -291,7 +288,7 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
             image[plane] /= response
             rms[plane] /= response
             photons[plane] /= response
-    level = pedestal + float(np.mean(levels)) * unit
+    level = pedestal + float(np.mean(level)) * unit
     return _finished(Background(image, rms, bad, level, bright, unit, photons))
 
 
@@ -309,23 +306,19 @@ def _bright_pixels(data, limit):
 
 
 def _finished(background):
-    """Mask what has no noise and what lies far below the sky."""
+    """Mask what lies far below the sky."""
     image, rms, bad = background.image, background.rms, background.mask
     noise = np.sqrt(np.median(rms[:: max(1, len(rms) // 500)] ** 2))
     if not (np.isfinite(noise) and noise > 0):
         raise DetectionError(
             f"the image is flat: all pixels near {background.level:g}, no noise, no stars"
         )
-    floor = 1e-3 * noise
-    # Most images have neither, which their extremes tell.
-    if rms.min() > floor and not image.min() < -_COLD * rms.min():
+    # Most images have no such pixels, which their extremes tell.
+    if not image.min() < -_COLD * rms.min():
         return background
     bad = np.zeros(image.shape, bool) if bad is None else bad.copy()
     for rows in row_strips(image.shape):
-        # Cells of constant pixels (padding, dead regions) have no noise and nothing to detect.
-        dead = ~(rms[rows] > floor)
-        rms[rows][dead] = noise
-        bad[rows] |= dead | (image[rows] < -_COLD * rms[rows])
+        bad[rows] |= image[rows] < -_COLD * rms[rows]
         image[rows][bad[rows]] = 0
     return replace(background, mask=bad)
 

@@ -11,6 +11,7 @@
 #include <stdlib.h>
 
 #include "inverse.h"
+#include "levels.h"
 #include "sky.h"
 #include "stars.h"
 
@@ -122,6 +123,28 @@ static void run_steps(const double *profiles, const double *flux, const double *
                   photons ? photons + k * n : NULL, noise, n, step + 3 * k, covariance + 9 * k,
                   chi2 + k);
     }
+}
+
+FOR_ANY_PROCESSOR
+static void run_count(const float *image, const unsigned char *mask, ptrdiff_t nx,
+                      const double *rows, ptrdiff_t n_rows, const double *columns,
+                      ptrdiff_t n_columns, const float *low, const float *rate, int32_t *counts) {
+    for (ptrdiff_t j = 0; j < n_rows; j++)
+        for (ptrdiff_t i = 0; i < n_columns; i++) {
+            const ptrdiff_t k = j * n_columns + i;
+            count_cell(image, mask, nx, (ptrdiff_t)rows[j], (ptrdiff_t)rows[j + 1],
+                       (ptrdiff_t)columns[i], (ptrdiff_t)columns[i + 1], low[k], rate[k],
+                       counts + N_STEPS * k);
+        }
+}
+
+FOR_ANY_PROCESSOR
+static void run_cubics(const float *coefficients, const double *edges, ptrdiff_t n_pieces,
+                       const float *offset, int subtract, float *image, ptrdiff_t ny,
+                       ptrdiff_t nx) {
+    for (ptrdiff_t y = 0; y < ny; y++)
+        row_cubics(coefficients + 4 * n_pieces * y, edges, n_pieces, offset, subtract,
+                   image + nx * y);
 }
 
 /* ---- arguments ------------------------------------------------------------------------------ */
@@ -484,12 +507,85 @@ static PyObject *star_steps(PyObject *self, PyObject *const *args, Py_ssize_t n_
     return finish(&held, good);
 }
 
+/* Edges of parts of an axis: whole numbers that ascend from 0 or more to `size` or less.  Returns
+ * the number of parts, or -1 with an exception set. */
+static ptrdiff_t read_edges(Buffers *held, PyObject *object, ptrdiff_t size, const double **edges) {
+    ptrdiff_t n;
+    if (!(*edges = numbers(held, object, 0, &n))) return -1;
+    int good = n > 1 && (*edges)[0] >= 0 && (*edges)[n - 1] <= (double)size;
+    for (ptrdiff_t k = 1; good && k < n; k++) good = (*edges)[k] >= (*edges)[k - 1];
+    if (good) return n - 1;
+    PyErr_SetString(PyExc_ValueError, "the edges do not ascend within the image");
+    return -1;
+}
+
+static PyObject *count_levels(PyObject *self, PyObject *const *args, Py_ssize_t n_args) {
+    Buffers held = {.n = 0};
+    const float *image, *low, *rate;
+    const unsigned char *mask = NULL;
+    const double *rows, *columns;
+    int32_t *counts;
+    ptrdiff_t n_image, n_mask, n_low, n_rate, n_counts, n_rows, n_columns;
+    int good = 0;
+    (void)self;
+    if (count(n_args, 7) == 0 && (image = memory(&held, args[0], 'f', sizeof(float), 0, &n_image))) {
+        const Py_buffer *view = &held.views[held.n - 1];
+        const int flat = view->ndim == 2;
+        const ptrdiff_t ny = flat ? view->shape[0] : 0, nx = flat ? view->shape[1] : 0;
+        n_mask = n_image;
+        if ((args[1] == Py_None || (mask = memory(&held, args[1], '?', 1, 0, &n_mask))) &&
+            (n_rows = read_edges(&held, args[2], ny, &rows)) >= 0 &&
+            (n_columns = read_edges(&held, args[3], nx, &columns)) >= 0 &&
+            (low = memory(&held, args[4], 'f', sizeof(float), 0, &n_low)) &&
+            (rate = memory(&held, args[5], 'f', sizeof(float), 0, &n_rate)) &&
+            (counts = memory(&held, args[6], 'i', sizeof(int32_t), 1, &n_counts))) {
+            const ptrdiff_t n = n_rows * n_columns;
+            if (n_mask != n_image || n_low != n || n_rate != n || n_counts != N_STEPS * n) {
+                PyErr_SetString(PyExc_ValueError, "the arrays make no cells");
+            } else {
+                Py_BEGIN_ALLOW_THREADS
+                run_count(image, mask, nx, rows, n_rows, columns, n_columns, low, rate, counts);
+                Py_END_ALLOW_THREADS
+                good = 1;
+            }
+        }
+    }
+    return finish(&held, good);
+}
+
+static PyObject *put_cubics(PyObject *self, PyObject *const *args, Py_ssize_t n_args) {
+    Buffers held = {.n = 0};
+    const float *coefficients, *offset;
+    const double *edges;
+    float *image;
+    ptrdiff_t n_coefficients, n_pieces, nx, n_image;
+    int subtract, good = 0;
+    (void)self;
+    if (count(n_args, 5) == 0 &&
+        (coefficients = memory(&held, args[0], 'f', sizeof(float), 0, &n_coefficients)) &&
+        (offset = memory(&held, args[2], 'f', sizeof(float), 0, &nx)) &&
+        (n_pieces = read_edges(&held, args[1], nx, &edges)) >= 0 &&
+        (subtract = PyObject_IsTrue(args[3])) >= 0 &&
+        (image = memory(&held, args[4], 'f', sizeof(float), 1, &n_image))) {
+        const ptrdiff_t ny = nx ? n_image / nx : 0;
+        if (ny * nx != n_image || 4 * n_pieces * ny != n_coefficients) {
+            PyErr_SetString(PyExc_ValueError, "the arrays make no cubics in the rows of an image");
+        } else {
+            Py_BEGIN_ALLOW_THREADS
+            run_cubics(coefficients, edges, n_pieces, offset, subtract, image, ny, nx);
+            Py_END_ALLOW_THREADS
+            good = 1;
+        }
+    }
+    return finish(&held, good);
+}
+
 #define METHOD(name) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, NULL}
 
 static PyMethodDef methods[] = {
     METHOD(evaluate), METHOD(jacobian), METHOD(to_sky), METHOD(rows_to_sky),
     METHOD(from_sky), METHOD(invert),   METHOD(star_profiles), METHOD(paint_stars),
-    METHOD(star_steps), {NULL, NULL, 0, NULL},
+    METHOD(star_steps), METHOD(count_levels), METHOD(put_cubics), {NULL, NULL, 0, NULL},
 };
 
 /* Cells in memory, all of a cell side by side: four cache lines. */

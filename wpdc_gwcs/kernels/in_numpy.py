@@ -9,15 +9,18 @@ import threading
 
 import numpy as np
 
+from wpdc_gwcs.kernels.levels_in_numpy import count_levels, put_cubics
 from wpdc_gwcs.kernels.stars_in_numpy import paint_stars, star_profiles, star_steps
 
 __all__ = [
     "CELL_ORDER",
+    "count_levels",
     "evaluate",
     "from_sky",
     "invert",
     "jacobian",
     "paint_stars",
+    "put_cubics",
     "rows_to_sky",
     "star_profiles",
     "star_steps",
