@@ -164,7 +164,7 @@ def test_counts_are_the_same_and_those_of_histograms(masked, compiled, rng):
     mask = rng.random(image.shape) < 0.3 if masked else None
     results = []
     for module in (compiled, levels_in_numpy):
-        counts = np.full((9, kernels.N_STEPS), -1, np.int32)
+        counts = np.full((9, kernels.N_STEPS), -1, np.intc)
         module.count_levels(image, mask, rows, columns, low, rate, counts)
         results.append(counts)
     assert_array_equal(*results)
@@ -194,7 +194,7 @@ def test_cubics_are_the_same_and_those_of_polyval(subtract, compiled, rng):
 
 def test_compiled_kernels_refuse_what_makes_no_cells(compiled, rng):
     image, rows, columns, low, rate = cells(rng)
-    counts = np.empty((9, kernels.N_STEPS), np.int32)
+    counts = np.empty((9, kernels.N_STEPS), np.intc)
     good = [image, None, rows, columns, low, rate, counts]
     compiled.count_levels(*good)
     for position, value, error in (

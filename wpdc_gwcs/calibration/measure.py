@@ -89,7 +89,7 @@ def measure_sources(frame, settings=None):
     >>> image = sky.exposures[0].frame(image=True)
     >>> sources = measure_sources(image, Settings(centroids="windowed"))
     >>> len(sources), round(sources.meta["fwhm"], 1)
-    (70, 2.8)
+    (68, 2.8)
     """
     settings = Settings() if settings is None else settings
     if frame.load_sources is not None:

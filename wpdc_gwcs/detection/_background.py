@@ -186,7 +186,8 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
         Inverse variance of the background, of any scale; pixels whose weight is not positive are
         not used.
     mesh : int, optional
-        Size in px of the cells within which the background is estimated.
+        Size in px, about, of the cells within which the background is estimated: cells of equal
+        sizes fill the image.
     filter_size : int, optional
         Size in cells of the median filter over the cells.
     overwrite : bool, optional
@@ -209,9 +210,10 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
     Notes
     -----
     The background is the mode of every cell after clipping (Bertin & Arnouts 1996, A&AS 117, 393),
-    median filtered and interpolated by bicubic splines.  The raw mosaic of a color
-    camera is recognized by a pattern of 2 x 2 px.  It has a background for each of the four planes,
-    which are scaled to the same response to stars.
+    median filtered and interpolated by bicubic splines.  Pixels that are equal to most others of
+    their cell (padding, dead regions) are masked.  The raw mosaic of a color camera is recognized
+    by a pattern of 2 x 2 px.  It has a background for each of the four planes, which are scaled to
+    the same response to stars.
 
     Examples
     --------

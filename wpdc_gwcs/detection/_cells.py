@@ -55,7 +55,7 @@ def measure_cells(image, mask, rows, columns, scale):
     rate = (_RATE / spread).astype(np.float32)
     # The median lies in the middle of a step, so that values in units lie evenly about the middles.
     low = (middle - (kernels.N_STEPS / 2 + 0.5) / _RATE * spread).astype(np.float32)
-    counts = np.empty((len(low), kernels.N_STEPS), np.int32)
+    counts = np.empty((len(low), kernels.N_STEPS), np.intc)
     kernels.count_levels(image, mask, rows.astype(float), columns.astype(float), low, rate, counts)
     level, scatter, number, mean, deviation = _clip(counts)
     # The values of a step lie about its middle.

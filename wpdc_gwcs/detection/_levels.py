@@ -87,7 +87,7 @@ def measure_levels(image, mask, mesh, filter_size, scale):
     mask : (ny, nx) bool ndarray or None
         True for pixels that do not count.
     mesh : int
-        Size of the cells in px, up to half of which is left over at most.
+        Size of the cells in px, about: cells of equal sizes fill the image.
     filter_size : int
         Size in cells of the median filter over the cells.
     scale : float

@@ -24,7 +24,7 @@ def count_levels(image, mask, rows, columns, low, rate, counts):
         First rows and columns of the cells, whole numbers, and those behind the last cell.
     low, rate : (M * N,) float32 ndarray
         The lowest value that counts, and the number of steps per unit, of every cell.
-    counts : (M * N, 256) int32 ndarray
+    counts : (M * N, 256) intc ndarray
         The numbers of pixels in each step are written here.
     """
     rows, columns = rows.astype(int), columns.astype(int)
