@@ -268,7 +268,7 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
         cells = max(4, mesh // period), filter_size, scale / unit
         levels, hidden = measure_levels(part, hidden, *cells)
         if hidden is not None:
-            bad = np.zeros(image.shape, bool) if bad is None else bad.copy()
+            bad = np.zeros(image.shape, bool) if bad is None else bad
             bad[plane] = hidden
         levels.subtract(part)
         level.append(np.median(levels.level))

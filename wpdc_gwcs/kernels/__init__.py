@@ -1,9 +1,9 @@
 """The inner loops: compiled if there was a compiler, otherwise the same in NumPy.
 
 `implementation` is the name of the one in use, ``"compiled"`` or ``"numpy"``.  The environment
-variable ``WPDC_GWCS_KERNELS=numpy`` selects NumPy.  The kernels of the WCS and of
-the levels of the sky do the same operations in the same order, so that their results are identical
-to the last bit; those of stars agree to rounding.
+variable ``WPDC_GWCS_KERNELS=numpy`` selects NumPy.  The kernels of the WCS and of the levels of the
+sky do the same operations in the same order, so that their results are identical to the last bit;
+those of stars agree to rounding.
 """
 
 import os
