@@ -9,6 +9,9 @@ _UNIX_FLAGS = ["-std=gnu11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fn
 _MSVC_FLAGS = ["/std:c11", "/O2", "/fp:precise"]
 
 
+_HEADERS = ("angles", "common", "inverse", "levels", "peaks", "plane", "sky", "stars")
+
+
 class BuildKernels(build_ext):
     """Compile with the flags of the compiler at hand."""
 
@@ -25,10 +28,7 @@ setup(
         Extension(
             "wpdc_gwcs.kernels._compiled",
             ["wpdc_gwcs/kernels/_compiled.c"],
-            depends=[
-                f"wpdc_gwcs/kernels/{name}.h"
-                for name in ("angles", "common", "inverse", "levels", "plane", "sky", "stars")
-            ],
+            depends=[f"wpdc_gwcs/kernels/{name}.h" for name in _HEADERS],
             py_limited_api=True,
             # Without a compiler the package installs all the same and computes in NumPy.
             optional=True,

@@ -96,6 +96,25 @@ def test_painted_stars_agree(half, compiled, grids, rng):
     assert np.abs(images[0] - before).max() > 10
 
 
+@pytest.mark.parametrize("name", ["compiled", "numpy"])
+@pytest.mark.parametrize("half", [0, 2, 30])
+def test_light_is_taken_off_once(name, half, request, rng):
+    module = request.getfixturevalue("compiled") if name == "compiled" else stars_in_numpy
+    center = np.rint(rng.uniform(-20, 70, (200, 2)))
+    center[:3] = (-1e6, 5), (1e12, 5), (5, -1e15)
+    light, before = rng.normal(size=(2, 40, 50)).astype(np.float32)
+    y, x = np.mgrid[:40, :50]
+    near = [(np.abs(x - a) <= half) & (np.abs(y - b) <= half) for a, b in center]
+    lit = np.any(near, axis=0)
+    changed = lit & (y >= 7) & (y < 33)
+    expected = np.where(changed, before - light, before), np.where(lit, 0, light)
+    image = before.copy()
+    module.take_stars(center, half, 7, 33, light, image)
+    assert_array_equal(image, expected[0])
+    assert_array_equal(light, expected[1])
+    assert 0 < changed.mean() < 1
+
+
 @pytest.mark.parametrize("photons", [False, True])
 def test_steps_agree(photons, compiled, rng):
     n, n_pixels = 50, 121
@@ -153,3 +172,14 @@ def test_compiled_functions_refuse_what_they_cannot_take(compiled, grids):
     ):
         with pytest.raises((TypeError, ValueError)):
             compiled.paint_stars(*good[:5], *args)
+    compiled.take_stars(center, np.int64(2), 0, 9, image, image.copy())
+    for args in (
+        (center[0][:1], 2, 0, 9, image, image),
+        (center, -1, 0, 9, image, image),
+        (center, 2.0, 0, 9, image, image),
+        (center, 2, 0, 9, image.ravel(), image),
+        (center, 2, 0, 9, image, image[1:].copy()),
+        (center, 2, 0, 9, image, image.astype(float)),
+    ):
+        with pytest.raises((TypeError, ValueError)):
+            compiled.take_stars(*args)

@@ -69,27 +69,6 @@ class Field:
     photons: np.ndarray | None = None
     full: np.ndarray | None = None
 
-    def rows(self, start, stop, *, image):
-        """Return some rows, with another image in place of theirs.
-
-        Parameters
-        ----------
-        start, stop : int
-            First row, and the row after the last.
-        image : (stop - start, nx) ndarray
-            Pixels.
-
-        Returns
-        -------
-        Field
-            The rows.
-        """
-        mask, photons, full = (
-            None if values is None else values[start:stop]
-            for values in (self.mask, self.photons, self.full)
-        )
-        return Field(image, self.rms[start:stop], mask, photons, full)
-
     def cut(self, stars, half, radius):
         """Make cut-outs around stars.
 

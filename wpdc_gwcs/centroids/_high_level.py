@@ -499,4 +499,5 @@ def _field_of(data, error, saturation=None):
         raise ValueError("error must be positive")
     unit = float(np.median(error))
     rms = np.broadcast_to(error / unit, image.shape)
-    return Field(np.where(bad, 0.0, image / unit), rms, bad if bad.any() else None), unit
+    image = np.where(bad, 0.0, image / unit).astype(np.float32)
+    return Field(image, rms, bad if bad.any() else None), unit

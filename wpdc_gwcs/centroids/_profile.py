@@ -212,11 +212,34 @@ class Models:
         first_row : int, optional
             Number of the first row.
         """
-        ends = [first_row - self.half, first_row + len(image) + self.half]
-        k = slice(*np.searchsorted(self.center[:, 1], ends))
-        if k.start < k.stop:
+        k, center = self._within(first_row, len(image))
+        if len(center):
             numbers = self.grids, self.oversampling, self.phase[k], self.shares[k], self.half
-            kernels.paint_stars(*numbers, self.center[k] - [0, first_row], self.flux[k], image)
+            kernels.paint_stars(*numbers, center, self.flux[k], image)
+
+    def take(self, light, image, rows, *, first_row=0):
+        """Take light off some rows of an image where these models were painted.
+
+        Parameters
+        ----------
+        light : (n, nx) float32 ndarray
+            The light of all models; on return without that in the pixels of these.
+        image : (n, nx) float32 ndarray
+            Rows of the image.
+        rows : (int, int)
+            The first of these rows that changes, and the one behind the last.
+        first_row : int, optional
+            Number of the first row.
+        """
+        center = self._within(first_row, len(image))[1]
+        if len(center):
+            kernels.take_stars(center, self.half, *rows, light, image)
+
+    def _within(self, first_row, n_rows):
+        """Models with light in some rows, and their centers in these rows."""
+        ends = [first_row - self.half, first_row + n_rows + self.half]
+        k = slice(*np.searchsorted(self.center[:, 1], ends))
+        return k, self.center[k] - [0, first_row]
 
 
 def spline_taps(position):

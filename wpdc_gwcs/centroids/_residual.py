@@ -8,12 +8,15 @@ from scipy.spatial import KDTree
 
 from wpdc_gwcs.centroids._fit import Stars
 from wpdc_gwcs.centroids._profile import Profile
+from wpdc_gwcs.cutouts import cut_squares
 
 __all__ = ["Painter", "Residual", "Scene"]
 
-# Number of pixels processed at a time: many where cut-outs of stars are made, otherwise as many as
-# fit into the cache of a processor.
-_STRIP, _CACHED = 3_000_000, 250_000
+# Pixels worked on at a time where stars are drawn, and where all pixels are touched: these fit into
+# the cache of a processor.
+_STRIP, _CACHED = 3_000_000, 500_000
+# Stars looked at at a time.
+_MANY = 10_000
 
 # Half widths in px with which stars are drawn, up to that of the profile; faint stars are smaller.
 _SIZES = (3, 5, 8, 12, 20)
@@ -149,59 +152,44 @@ class Scene:
         both = Stars(*map(np.concatenate, zip(gone._replace(flux=-gone.flux), come, strict=True)))
         models, image = self._painter.models(both), self.field.image
         margin = int(np.ceil(radius))
-        candidates = _near_any(stars, changed, self._painter.half(both.flux).max() + margin + 1)
-        row = np.clip(np.rint(stars.y[candidates]), 0, len(image) - 1)
-        candidates, row = candidates[order := np.argsort(row)], row[order]
+        rows = _near_any(stars, changed, self._painter.half(both.flux).max() + margin + 1)
+        rows = rows[np.argsort(np.rint(stars.y[rows]))]
+        near, was = stars.take(rows), old.take(rows)
+        xc, yc = (np.rint(place).astype(int) for place in (near.x, near.y))
+        beside = np.empty((len(rows), 2 * margin + 1, 2 * margin + 1), np.float32)
+        strip_of = np.clip(yc, 0, len(image) - 1)
         step = max(1, _STRIP // image.shape[1])
         work = np.zeros((step + 2 * margin, image.shape[1]), np.float32)
-        lit = _lit_rows(models, len(image))
-        found = [np.zeros(0, int)]
         for first in range(0, len(image), step):
             last = min(first + step, len(image))
             low, high = max(first - margin, 0), min(last + margin, len(image))
             light = work[: high - low]
             for one in models:
                 one.paint(light, first_row=low)
-            for start, stop in _runs(lit[first:last]):
-                image[first + start : first + stop] -= light[first - low :][start:stop]
-            k = candidates[slice(*np.searchsorted(row, [first, last]))]
-            if len(k):
-                sides = old.take(k), stars.take(k)
-                found.append(k[self._disturbed(light, low, *sides, changed[k], radius, settled)])
-            for start, stop in _runs(lit[low:high]):
-                light[start:stop] = 0
-        return np.sort(np.concatenate(found))
+            k = slice(*np.searchsorted(strip_of, [first, last]))
+            beside[k] = cut_squares(light, xc[k], yc[k] - low, margin)
+            for one in models:
+                one.take(light, image[low:high], (first - low, last - low), first_row=low)
+        parts = [slice(k, k + _MANY) for k in range(0, len(rows), _MANY)]
+        found = [
+            self._disturbed(beside[k], was.take(k), near.take(k), changed[rows[k]], radius, settled)
+            for k in parts
+        ]
+        return np.sort(rows[np.concatenate([np.zeros(0, bool), *found])])
 
-    def _disturbed(self, light, low, old, new, changed, radius, settled):
+    def _disturbed(self, light, old, new, changed, radius, settled):
         """Mark the stars that have light of other stars in their pixels."""
-        half = int(np.ceil(radius))
-        part = self.field.rows(low, low + len(light), image=light)
-        at = new._replace(y=new.y - low)
-        xc, yc, pixels, use, sky = part.cut(at, half, radius)
-        others = pixels.copy()
+        half = light.shape[1] // 2
+        xc, yc, _, use, sky = self.field.cut(new, half, radius)
+        light = light.reshape(use.shape).astype(float)
+        others = light.copy()
         profile = self._painter.profile
         for sign, side in ((-1, new), (1, old)):
             k = np.flatnonzero(changed & (side.flux > 0))
             if len(k):
-                others[k] += sign * side.take(k).light(profile, xc[k], yc[k] + low, half)
-        limit = settled * (np.sqrt(sky.variance) + _SHARE * np.abs(pixels))
+                others[k] += sign * side.take(k).light(profile, xc[k], yc[k], half)
+        limit = settled * (np.sqrt(sky.variance) + _SHARE * np.abs(light))
         return (use & (np.abs(others) > limit)).any(axis=1)
-
-
-def _lit_rows(models, n_rows):
-    """Mark the rows of an image that have light of any of the models."""
-    change = np.zeros(n_rows + 1, int)
-    for one in models:
-        row = one.center[:, 1].astype(int)
-        np.add.at(change, np.clip(row - one.half, 0, n_rows), 1)
-        np.add.at(change, np.clip(row + one.half + 1, 0, n_rows), -1)
-    return np.cumsum(change[:-1]) > 0
-
-
-def _runs(marks):
-    """Find the start of each run of marks, and the position after its end."""
-    edges = np.flatnonzero(np.diff(marks, prepend=False, append=False))
-    return edges.reshape(-1, 2)
 
 
 def _near_any(stars, changed, reach):

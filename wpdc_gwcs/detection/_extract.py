@@ -6,31 +6,33 @@ import sep
 from wpdc_gwcs.cutouts import cut_squares
 from wpdc_gwcs.detection._shapes import SIGMA_PER_FWHM, mode, sizes, window
 from wpdc_gwcs.detection._strips import high_pixels
+from wpdc_gwcs.detection._windows import CELL, find_windows, high_cells
 
 __all__ = ["extract_peaks", "is_broad", "search", "star_size", "typical_fwhm"]
 
 # Smoothing before the threshold: close to a matched filter for FWHM 1.5 to 3 px, and narrow enough
 # not to merge neighbors.
-_KERNEL = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]) / 16
+_LINE = np.array([1.0, 2.0, 1.0]) / 4
 
 # Stars broader than this, FWHM in px, would fall to pieces under that kernel: the noise makes peaks
 # of their own on rings and trails.
 _BROAD = 4.5
 
 # Rows searched at a time, and their overlap: every source is taken whole, from the strip that holds
-# its peak.  Arrays of more pixels than that would be had from the system anew each time, which
-# takes longer than the work on them.
+# its peak.
 _STRIP = 1024
 _OVERLAP = 64
-_PIXELS = 7_000_000
 
 # Pixels that sep has room for beyond those of sources; and the share of pixels that noise alone
 # lifts above the threshold before it is smoothed: they need room only where noise is correlated,
 # and that much there is.
-_ROOM = 300_000
+_ROOM, _ROOM_IN_WINDOW = 300_000, 1000
 _BY_CHANCE = 0.03
 # One in this many rows is used to estimate the number of pixels of sources.
 _SAMPLED = 4
+
+# Share of an image from which on windows about what is high would be no less work than all of it.
+_CROWDED = 0.15
 
 # Sources that tell the size of the stars.
 _N_BRIGHT = 500
@@ -57,13 +59,12 @@ def extract_peaks(background, threshold, deblend_contrast, fwhm=0.0):
     """
     parts = []
     for start, _, found in search(background, threshold, deblend_contrast, fwhm):
-        for name in ("y", "ypeak", "ycpeak"):
-            found[name] += start
+        _shift(found, 0, start)
         parts.append(found)
     return np.concatenate(parts)
 
 
-def search(background, threshold, deblend_contrast, fwhm=0.0):
+def search(background, threshold, deblend_contrast, fwhm=0.0, *, sparse=False):
     """Extract peaks strip by strip, because sep compares every source with every other one.
 
     Parameters
@@ -72,6 +73,8 @@ def search(background, threshold, deblend_contrast, fwhm=0.0):
         Image without background, or what gives its rows.
     threshold, deblend_contrast, fwhm
         As for `extract_peaks`.
+    sparse : bool, optional
+        Whether most of the image is expected to have no peak: sep then sees only what has.
 
     Yields
     ------
@@ -84,32 +87,73 @@ def search(background, threshold, deblend_contrast, fwhm=0.0):
     """
     # sep's defaults are for small images: it gives up where more pixels or branches are active.
     sep.set_sub_object_limit(8192)
-    kernel = _kernel(fwhm)
-    threshold = threshold * np.sqrt((kernel**2).sum())
+    line = _line(fwhm)
+    options = {
+        "thresh": threshold * (line**2).sum(),
+        "filter_kernel": np.outer(line, line),
+        "deblend_cont": deblend_contrast,
+    }
     overlap = max(_OVERLAP, int(3 * fwhm))
-    n_rows, n_columns = background.shape
-    step = int(np.clip(_PIXELS // n_columns - 2 * overlap, overlap, _STRIP))
-    for first in range(0, n_rows, step):
-        last = min(first + step, n_rows)
+    n_rows = background.shape[0]
+    for first in range(0, n_rows, _STRIP):
+        last = min(first + _STRIP, n_rows)
         start = max(first - overlap, 0)
         strip = background.rows(start, min(last + overlap, n_rows))
-        # Room for all pixels of all sources; no more, because sep writes to all of it every time.
-        high = high_pixels(strip.image[::_SAMPLED], strip.rms[::_SAMPLED], threshold)
-        active = _SAMPLED * sum(np.count_nonzero(part) for _, part in high)
-        active -= int(_BY_CHANCE * strip.image.size)
-        sep.set_extract_pixstack(min(_ROOM + 3 * max(active, 0), _ROOM + strip.image.size))
-        found = sep.extract(
-            strip.image,
-            threshold,
-            err=strip.rms,
-            mask=strip.mask,
-            minarea=3,
-            filter_kernel=kernel,
-            filter_type="conv",
-            deblend_cont=deblend_contrast,
-        )
+        cells = None
+        if sparse:
+            cells = high_cells(strip.image, strip.rms, strip.mask, line, options["thresh"])
+            if not cells.any():
+                continue
+        if cells is None or cells.mean() > _CROWDED:
+            found = _extract(strip, options)
+        else:
+            found = _extract_in_windows(strip, cells, options)
         row = found["ycpeak"] + start
         yield start, strip, found[(row >= first) & (row < last)]
+
+
+def _extract(strip, options):
+    """Extract the peaks of a strip."""
+    # Room for all pixels of all sources; no more, because sep writes to all of it every time.
+    high = high_pixels(strip.image[::_SAMPLED], strip.rms[::_SAMPLED], options["thresh"])
+    active = _SAMPLED * sum(np.count_nonzero(part) for _, part in high)
+    active -= int(_BY_CHANCE * strip.image.size)
+    room = min(_ROOM + 3 * max(active, 0), _ROOM + strip.image.size)
+    return _call_sep(strip.image, strip.rms, strip.mask, room, options)
+
+
+def _extract_in_windows(strip, cells, options):
+    """Extract the peaks of each window of a strip about the cells in which something is high.
+
+    A source does not reach beyond these cells, so it has the same pixels in a window.
+    """
+    margin = len(options["filter_kernel"]) // 2 + 1
+    places, labels = find_windows(cells, strip.shape, margin)
+    planes, parts = (strip.image, strip.rms, strip.mask), []
+    for place in places:
+        image, rms, mask = (
+            None if plane is None else np.ascontiguousarray(plane[place]) for plane in planes
+        )
+        parts.append(_call_sep(image, rms, mask, _ROOM_IN_WINDOW + image.size, options))
+    found = np.concatenate(parts)
+    corners = np.array([[columns.start, rows.start] for rows, columns in places])
+    number = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    _shift(found, *corners[number].T)
+    # Where windows overlap, each source is taken from its own.
+    return found[labels[found["ycpeak"] // CELL, found["xcpeak"] // CELL] == number + 1]
+
+
+def _call_sep(image, rms, mask, room, options):
+    """Extract the peaks of an image, with room for so many pixels of sources."""
+    sep.set_extract_pixstack(room)
+    return sep.extract(image, err=rms, mask=mask, minarea=3, filter_type="conv", **options)
+
+
+def _shift(found, dx, dy):
+    """Move peaks, in place."""
+    for axis, step in (("x", dx), ("y", dy)):
+        for name in (axis, f"{axis}peak", f"{axis}cpeak", f"{axis}min", f"{axis}max"):
+            found[name] += step
 
 
 def is_broad(fwhm):
@@ -128,14 +172,14 @@ def is_broad(fwhm):
     return fwhm > _BROAD
 
 
-def _kernel(fwhm):
-    """Filter of unit sum for stars of this FWHM."""
+def _line(fwhm):
+    """Filter along one axis, of unit sum, for stars of this FWHM."""
     if not is_broad(fwhm):
-        return _KERNEL
+        return _LINE
     sigma = fwhm * SIGMA_PER_FWHM
     step = np.arange(-int(2 * sigma), int(2 * sigma) + 1)
     line = np.exp(-0.5 * (step / sigma) ** 2)
-    return np.outer(line, line) / line.sum() ** 2
+    return line / line.sum()
 
 
 def typical_fwhm(background, found):

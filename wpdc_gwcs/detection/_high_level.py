@@ -200,7 +200,7 @@ def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_co
         raise ValueError(f"threshold must be positive, got {threshold}")
     fwhm = sources.meta["fwhm"]
     saturation, parts = sources.meta["saturation"], []
-    for start, strip, found in search(residual, threshold, deblend_contrast, fwhm):
+    for start, strip, found in search(residual, threshold, deblend_contrast, fwhm, sparse=True):
         if len(found):
             part = _measure(strip, found, fwhm, gain, saturation)
             part["y"] += start

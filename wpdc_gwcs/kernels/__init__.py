@@ -1,9 +1,9 @@
 """The inner loops: compiled if there was a compiler, otherwise the same in NumPy.
 
 `implementation` is the name of the one in use, ``"compiled"`` or ``"numpy"``.  The environment
-variable ``WPDC_GWCS_KERNELS=numpy`` selects NumPy.  The kernels of the WCS and of the levels of the
-sky do the same operations in the same order, so that their results are identical to the last bit;
-those of stars agree to rounding.
+variable ``WPDC_GWCS_KERNELS=numpy`` selects NumPy.  The kernels of the WCS, of the levels of the
+sky and of peaks do the same operations in the same order, so that their results are identical to
+the last bit; those of stars agree to rounding.
 """
 
 import os
@@ -27,11 +27,13 @@ __all__ = [
     "implementation",
     "invert",
     "jacobian",
+    "mark_cells",
     "paint_stars",
     "put_cubics",
     "rows_to_sky",
     "star_profiles",
     "star_steps",
+    "take_stars",
     "tangent_numbers",
     "to_sky",
 ]
@@ -61,9 +63,11 @@ evaluate = _kernels.evaluate
 from_sky = _kernels.from_sky
 invert = _kernels.invert
 jacobian = _kernels.jacobian
+mark_cells = _kernels.mark_cells
 paint_stars = _kernels.paint_stars
 put_cubics = _kernels.put_cubics
 rows_to_sky = _kernels.rows_to_sky
 star_profiles = _kernels.star_profiles
 star_steps = _kernels.star_steps
+take_stars = _kernels.take_stars
 to_sky = _kernels.to_sky

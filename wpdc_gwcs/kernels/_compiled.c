@@ -12,6 +12,7 @@
 
 #include "inverse.h"
 #include "levels.h"
+#include "peaks.h"
 #include "sky.h"
 #include "stars.h"
 
@@ -126,6 +127,13 @@ static void run_steps(const double *profiles, const double *flux, const double *
 }
 
 FOR_ANY_PROCESSOR
+static void run_take(const double *centers, ptrdiff_t n_stars, ptrdiff_t half, ptrdiff_t first,
+                     ptrdiff_t last, float *light, float *image, ptrdiff_t ny, ptrdiff_t nx) {
+    for (ptrdiff_t k = 0; k < n_stars; k++)
+        take_star(centers[2 * k], centers[2 * k + 1], half, first, last, light, image, ny, nx);
+}
+
+FOR_ANY_PROCESSOR
 static void run_count(const float *image, const unsigned char *mask, ptrdiff_t nx,
                       const double *rows, ptrdiff_t n_rows, const double *columns,
                       ptrdiff_t n_columns, const float *low, const float *rate, int32_t *counts) {
@@ -145,6 +153,15 @@ static void run_cubics(const float *coefficients, const double *edges, ptrdiff_t
     for (ptrdiff_t y = 0; y < ny; y++)
         row_cubics(coefficients + 4 * n_pieces * y, edges, n_pieces, offset, subtract,
                    image + nx * y);
+}
+
+FOR_ANY_PROCESSOR
+static void run_mark(const float *image, const float *rms, const unsigned char *mask, ptrdiff_t ny,
+                     ptrdiff_t nx, const float *line, ptrdiff_t half, float factor, ptrdiff_t size,
+                     ptrdiff_t first, ptrdiff_t last, float *work, const float **rows,
+                     unsigned char *cells) {
+    mark_cells_between(image, rms, mask, ny, nx, line, half, factor, size, first, last, work, rows,
+                       cells);
 }
 
 /* ---- arguments ------------------------------------------------------------------------------ */
@@ -176,6 +193,15 @@ static void *memory(Buffers *held, PyObject *object, char type, size_t width, in
     *size = view->len / (ptrdiff_t)width;
     /* An array without elements may have no memory. */
     return view->buf ? view->buf : view;
+}
+
+/* Whole numbers; returns 0 with an exception set if they are none. */
+static int whole_numbers(PyObject *const *args, int n, ptrdiff_t *values) {
+    for (int k = 0; k < n; k++) {
+        values[k] = PyNumber_AsSsize_t(args[k], PyExc_OverflowError);
+        if (PyErr_Occurred()) return 0;
+    }
+    return 1;
 }
 
 /* The numbers of a contiguous float64 array. */
@@ -474,6 +500,33 @@ static PyObject *paint_stars(PyObject *self, PyObject *const *args, Py_ssize_t n
     return finish(&held, good);
 }
 
+static PyObject *take_stars(PyObject *self, PyObject *const *args, Py_ssize_t n_args) {
+    Buffers held = {.n = 0};
+    const double *centers;
+    float *light, *image;
+    ptrdiff_t n_centers, n_light, n_image;
+    int good = 0;
+    (void)self;
+    if (count(n_args, 6) || !(centers = numbers(&held, args[0], 0, &n_centers)) ||
+        !(light = memory(&held, args[4], 'f', sizeof(float), 1, &n_light)))
+        return finish(&held, 0);
+    const Py_buffer *view = &held.views[held.n - 1];
+    const int flat = view->ndim == 2;
+    const ptrdiff_t ny = flat ? view->shape[0] : 0, nx = flat ? view->shape[1] : 0;
+    ptrdiff_t whole[3]; /* half, first, last */
+    if (whole_numbers(args + 1, 3, whole) && (image = memory(&held, args[5], 'f', sizeof(float), 1, &n_image))) {
+        if (!flat || n_image != n_light || n_centers % 2 || whole[0] < 0 || whole[0] > 1000000) {
+            PyErr_SetString(PyExc_ValueError, "the image and the light must have the same shape");
+        } else {
+            Py_BEGIN_ALLOW_THREADS
+            run_take(centers, n_centers / 2, whole[0], whole[1], whole[2], light, image, ny, nx);
+            Py_END_ALLOW_THREADS
+            good = 1;
+        }
+    }
+    return finish(&held, good);
+}
+
 static PyObject *star_steps(PyObject *self, PyObject *const *args, Py_ssize_t n_args) {
     Buffers held = {.n = 0};
     const double *profiles, *flux, *pixels, *variance, *photons = NULL, *noise;
@@ -580,12 +633,58 @@ static PyObject *put_cubics(PyObject *self, PyObject *const *args, Py_ssize_t n_
     return finish(&held, good);
 }
 
+static PyObject *mark_cells(PyObject *self, PyObject *const *args, Py_ssize_t n_args) {
+    Buffers held = {.n = 0};
+    const float *image, *rms, *line;
+    const unsigned char *mask = NULL;
+    unsigned char *cells;
+    ptrdiff_t n_image, n_rms, n_mask, n_line, n_cells;
+    int good = 0;
+    (void)self;
+    if (count(n_args, 9) || !(image = memory(&held, args[0], 'f', sizeof(float), 0, &n_image)))
+        return finish(&held, 0);
+    const Py_buffer *view = &held.views[held.n - 1];
+    const int flat = view->ndim == 2;
+    const ptrdiff_t ny = flat ? view->shape[0] : 0, nx = flat ? view->shape[1] : 0;
+    n_mask = n_image;
+    if ((rms = memory(&held, args[1], 'f', sizeof(float), 0, &n_rms)) &&
+        (args[2] == Py_None || (mask = memory(&held, args[2], '?', 1, 0, &n_mask))) &&
+        (line = memory(&held, args[3], 'f', sizeof(float), 0, &n_line)) &&
+        (cells = memory(&held, args[8], '?', 1, 1, &n_cells))) {
+        ptrdiff_t whole[3]; /* size, first, last */
+        const double factor = PyFloat_AsDouble(args[4]);
+        if (PyErr_Occurred() || !whole_numbers(args + 5, 3, whole)) return finish(&held, 0);
+        const ptrdiff_t size = whole[0], first = whole[1], last = whole[2];
+        const ptrdiff_t m = size > 0 ? (ny + size - 1) / size : 0;
+        if (!flat || n_rms != n_image || n_mask != n_image || n_line % 2 == 0 || size < 1 ||
+            n_cells != m * ((nx + size - 1) / size) || first < 0 || last > m) {
+            PyErr_SetString(PyExc_ValueError, "the arrays make no cells");
+            return finish(&held, 0);
+        }
+        float *work = malloc((size_t)((n_line + 1) * (nx + n_line)) * sizeof(float));
+        const float **rows = malloc((size_t)n_line * sizeof(float *));
+        if (work && rows) {
+            Py_BEGIN_ALLOW_THREADS
+            run_mark(image, rms, mask, ny, nx, line, n_line / 2, (float)factor, size, first, last,
+                     work, rows, cells);
+            Py_END_ALLOW_THREADS
+            good = 1;
+        } else {
+            PyErr_NoMemory();
+        }
+        free(work);
+        free(rows);
+    }
+    return finish(&held, good);
+}
+
 #define METHOD(name) {#name, (PyCFunction)(void (*)(void))name, METH_FASTCALL, NULL}
 
 static PyMethodDef methods[] = {
     METHOD(evaluate), METHOD(jacobian), METHOD(to_sky), METHOD(rows_to_sky),
     METHOD(from_sky), METHOD(invert),   METHOD(star_profiles), METHOD(paint_stars),
-    METHOD(star_steps), METHOD(count_levels), METHOD(put_cubics), {NULL, NULL, 0, NULL},
+    METHOD(star_steps), METHOD(count_levels), METHOD(put_cubics),
+    METHOD(mark_cells), METHOD(take_stars), {NULL, NULL, 0, NULL},
 };
 
 /* Cells in memory, all of a cell side by side: four cache lines. */

@@ -10,7 +10,8 @@ import threading
 import numpy as np
 
 from wpdc_gwcs.kernels.levels_in_numpy import count_levels, put_cubics
-from wpdc_gwcs.kernels.stars_in_numpy import paint_stars, star_profiles, star_steps
+from wpdc_gwcs.kernels.peaks_in_numpy import mark_cells
+from wpdc_gwcs.kernels.stars_in_numpy import paint_stars, star_profiles, star_steps, take_stars
 
 __all__ = [
     "CELL_ORDER",
@@ -19,11 +20,13 @@ __all__ = [
     "from_sky",
     "invert",
     "jacobian",
+    "mark_cells",
     "paint_stars",
     "put_cubics",
     "rows_to_sky",
     "star_profiles",
     "star_steps",
+    "take_stars",
     "to_sky",
 ]
 

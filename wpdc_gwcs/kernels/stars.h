@@ -111,6 +111,24 @@ INLINE void paint_star(const Spline *spline, const Phase *phase, double x, doubl
     }
 }
 
+/* Take the light in the pixels of one star off some rows of an image, and leave no light there: the
+ * pixels that stars share are taken off once. */
+INLINE void take_star(double x, double y, ptrdiff_t half, ptrdiff_t first, ptrdiff_t last,
+                      float *restrict light, float *restrict image, ptrdiff_t ny, ptrdiff_t nx) {
+    if (!(fabs(x) < 1e9 && fabs(y) < 1e9)) return;
+    const ptrdiff_t xc = (ptrdiff_t)x, yc = (ptrdiff_t)y;
+    const ptrdiff_t left = xc - half < 0 ? 0 : xc - half;
+    const ptrdiff_t right = xc + half >= nx ? nx : xc + half + 1;
+    const ptrdiff_t top = yc - half < 0 ? 0 : yc - half;
+    const ptrdiff_t bottom = yc + half >= ny ? ny : yc + half + 1;
+    for (ptrdiff_t row = top; row < bottom; row++) {
+        float *restrict from = light + row * nx, *restrict to = image + row * nx;
+        if (row >= first && row < last)
+            for (ptrdiff_t k = left; k < right; k++) to[k] -= from[k];
+        for (ptrdiff_t k = left; k < right; k++) from[k] = 0.0f;
+    }
+}
+
 typedef struct {
     double inverse_gain, mismatch;
 } NoiseNumbers;

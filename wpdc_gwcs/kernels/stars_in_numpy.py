@@ -7,7 +7,7 @@ grids.
 
 import numpy as np
 
-__all__ = ["paint_stars", "star_profiles", "star_steps"]
+__all__ = ["paint_stars", "star_profiles", "star_steps", "take_stars"]
 
 # Number of pixels of stars processed at once, to limit the memory.
 _CHUNK = 400_000
@@ -88,18 +88,47 @@ def paint_stars(grids, oversampling, phase, shares, half, center, flux, image):
     flat, shape = image.reshape(-1), image.shape
     n_pixels = (2 * half + 1) ** 2
     size = max(1, _CHUNK // n_pixels)
-    step = np.arange(-half, half + 1)
     for start in range(0, len(flux), size):
         k = slice(start, start + size)
         model = np.empty((1, len(flux[k]), n_pixels))
         star_profiles(grids, oversampling, phase[k], shares[k], half, model)
-        xc, yc = center[k].T.astype(int)
-        iy, ix = yc[:, None] + step, xc[:, None] + step
-        inside = ((iy >= 0) & (iy < shape[0]))[:, :, None]
-        inside = (inside & ((ix >= 0) & (ix < shape[1]))[:, None, :]).reshape(model[0].shape)
-        index = (iy[:, :, None] * shape[1] + ix[:, None, :]).reshape(model[0].shape)
+        index, inside = _pixels(center[k], half, shape)
         value = (flux[k, None] * model[0]).astype(np.float32)
         np.add.at(flat, index[inside], value[inside])
+
+
+def take_stars(center, half, first, last, light, image):
+    """Take light off an image in the pixels of the stars that were painted.
+
+    Parameters
+    ----------
+    center : (N, 2) ndarray
+        Central pixels of the cut-outs, x and y.
+    half : int
+        The cut-outs are 2 half + 1 px wide.
+    first, last : int
+        The first row of the image that changes, and the one behind the last.
+    light : (ny, nx) float32 ndarray
+        The light; it becomes zero in all these pixels.
+    image : (ny, nx) float32 ndarray
+        The image.
+    """
+    index, inside = _pixels(center, half, image.shape)
+    index = np.unique(index[inside])
+    row = index // image.shape[1]
+    mine = index[(row >= first) & (row < last)]
+    image.reshape(-1)[mine] -= light.reshape(-1)[mine]
+    light.reshape(-1)[index] = 0
+
+
+def _pixels(center, half, shape):
+    """Find the pixels of cut-outs: indices in a flat image, and whether they are on it."""
+    step = np.arange(-half, half + 1)
+    xc, yc = center.T.astype(int)
+    iy, ix = yc[:, None] + step, xc[:, None] + step
+    inside = ((iy >= 0) & (iy < shape[0]))[:, :, None]
+    inside = (inside & ((ix >= 0) & (ix < shape[1]))[:, None, :]).reshape(len(center), -1)
+    return (iy[:, :, None] * shape[1] + ix[:, None, :]).reshape(inside.shape), inside
 
 
 def star_steps(profiles, flux, pixels, use, variance, photons, noise, step, covariance, chi2):

@@ -1,0 +1,78 @@
+"""Windows of an image outside which nothing exceeds a threshold."""
+
+import numpy as np
+from scipy import ndimage
+
+from wpdc_gwcs import kernels
+from wpdc_gwcs.threads import map_threads
+
+__all__ = ["CELL", "find_windows", "high_cells"]
+
+# Side of a cell in px, and rows of cells that are looked at at a time.
+CELL = 32
+_CELL_ROWS = 8
+
+# Rounding of float32 in a filter: what is so near the threshold counts as higher.
+_ROUNDING = 1e-4
+
+_TOUCHING = np.ones((3, 3), bool)
+
+
+def high_cells(image, rms, mask, line, factor):
+    """Mark the cells with a pixel that is above a threshold once the image is smoothed.
+
+    Parameters
+    ----------
+    image, rms : (ny, nx) float32 ndarray
+        Image, and its noise, C-contiguous.
+    mask : (ny, nx) bool ndarray or None
+        True for pixels that count as 0, as those beyond the image do.
+    line : (2 n + 1,) ndarray
+        Weights of the filter along each axis, the same from both ends.
+    factor : float
+        The threshold, in standard deviations of the noise of single pixels.
+
+    Returns
+    -------
+    (my, mx) ndarray of bool
+        Cells of 32 x 32 px.
+    """
+    line, factor = np.asarray(line, np.float32), (1 - _ROUNDING) * factor
+    n, m = (-(-size // CELL) for size in image.shape)
+    cells = np.zeros((n, m), bool)
+
+    def mark(first):
+        last = min(first + _CELL_ROWS, n)
+        kernels.mark_cells(image, rms, mask, line, factor, CELL, first, last, cells)
+
+    map_threads(mark, range(0, n, _CELL_ROWS))
+    return cells
+
+
+def find_windows(cells, shape, margin):
+    """Find windows that hold the cells marked, those that touch each other in the same window.
+
+    Parameters
+    ----------
+    cells : (my, mx) ndarray of bool
+        Cells, as from `high_cells`.
+    shape : (int, int)
+        Shape of the image.
+    margin : int
+        Pixels of the windows around their cells.
+
+    Returns
+    -------
+    list of (slice, slice)
+        Rows and columns of each window.
+    labels : (my, mx) ndarray of int
+        Number of the window of each cell, from 1; 0 for cells not marked.  Windows overlap where
+        their cells mesh.
+    """
+    labels, _ = ndimage.label(cells, _TOUCHING)
+
+    def widened(cells, size):
+        return slice(max(CELL * cells.start - margin, 0), min(CELL * cells.stop + margin, size))
+
+    found = ndimage.find_objects(labels)
+    return [tuple(map(widened, window, shape)) for window in found], labels
