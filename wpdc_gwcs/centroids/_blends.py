@@ -7,6 +7,7 @@ from wpdc_gwcs.centroids._build import rank_in_parts
 from wpdc_gwcs.centroids._inverses import inverses
 from wpdc_gwcs.centroids._joint import cross_products, pairs_that_share
 from wpdc_gwcs.centroids._modes import blur_modes, companions, odd_modes, reduced_normal
+from wpdc_gwcs.threads import map_threads
 
 __all__ = ["judge_profiles", "weigh_neighbors"]
 
@@ -138,10 +139,11 @@ def judge_profiles(field, profile, noise, stars, clean, fwhm, radius, *, subtrac
     modes = blur_modes(mean, scale) + odd_modes(mean, scale)
     changes = companions(mean, modes, scale)
     options = {"radius": radius, "subtracted": subtracted}
-    parts = [
-        _normal(field, profile, noise, stars.take(slice(n, n + _CHUNK)), modes, **options)
-        for n in range(0, len(rows), _CHUNK)
-    ]
+
+    def normal(n):
+        return _normal(field, profile, noise, stars.take(slice(n, n + _CHUNK)), modes, **options)
+
+    parts = map_threads(normal, range(0, len(rows), _CHUNK))
     left, right, freedom = (np.concatenate(column) for column in zip(*parts, strict=True))
     covariance = inverses(left)
     amplitude = np.einsum("sij,sj->si", covariance, right)

@@ -8,6 +8,7 @@ from scipy.ndimage import percentile_filter
 
 from wpdc_gwcs import kernels
 from wpdc_gwcs.cutouts import cut_squares, on_image
+from wpdc_gwcs.threads import map_threads
 
 __all__ = [
     "Field",
@@ -228,11 +229,13 @@ def fit_stars(field, profile, noise, stars, *, radius, own=None):
     StarFits
         The fits.
     """
-    parts = []
-    for start in range(0, max(len(stars.x), 1), _CHUNK):
+
+    def fit(start):
         rows = slice(start, start + _CHUNK)
         mine = None if own is None else own.take(rows)
-        parts.append(_fit_chunk(field, profile, noise, stars.take(rows), radius, mine))
+        return _fit_chunk(field, profile, noise, stars.take(rows), radius, mine)
+
+    parts = map_threads(fit, range(0, max(len(stars.x), 1), _CHUNK))
     x, y, flux, *rest = (np.concatenate(columns) for columns in zip(*parts))
     return StarFits(Stars(x, y, flux), *rest)
 
