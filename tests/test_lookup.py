@@ -10,7 +10,7 @@ from scipy.interpolate import RBFInterpolator
 from wpdc_gwcs import ResidualMap, build_lookup_table
 from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.lookup import N_FOLDS, TableChoice, choose_table
-from wpdc_gwcs.lookup._smoother import Bins, Spectrum, kernel_matrix, polynomials, smooth_surface
+from wpdc_gwcs.lookup._smoother import Bins, Smoother, Spectrum, kernel_matrix, polynomials
 
 SHAPE = (1500, 2048)
 
@@ -153,7 +153,24 @@ class TestNumerics:
             np.stack([bins.u, bins.v], axis=1), bins.value, kernel=kernel, epsilon=epsilon,
             degree=degree, smoothing=1e-2 * bins.variance,
         )(np.stack([u, v], axis=1))  # fmt: skip
-        assert_allclose(smooth_surface(bins, bins.value, choice)(u, v), expected, atol=1e-7)
+        assert_allclose(Smoother(bins, choice)(bins.value)(u, v), expected, atol=1e-7)
+
+    @pytest.mark.parametrize(("kernel", "least"), [("quintic", 2), ("gaussian", 1)])
+    def test_without_its_kernel_a_surface_is_a_polynomial(self, rng, kernel, least):
+        """What saves time for flat choices is what their kernels would give."""
+        bins = Bins(make_map(rng, 600).coarsen(4))
+        spectrum = Spectrum(bins, kernel, 1.0, least)
+        smoothing = 1e5 * spectrum.eigenvalues.max()
+        _, freedom = next(iter(spectrum.scores(bins.value, np.array([smoothing]), [least])))
+        flat = TableChoice(kernel, least, smoothing, freedom=float(freedom[0]))
+        full = replace(flat, freedom=0.0)
+        assert flat.flat
+        assert not full.flat
+        u, v = rng.uniform(-1, 1, (2, 50))
+        expected = Smoother(bins, full)(bins.value)(u, v)
+        assert_allclose(
+            Smoother(bins, flat)(bins.value)(u, v), expected, atol=1e-3 * np.ptp(expected)
+        )
 
     @pytest.mark.parametrize(
         ("kernel", "epsilon", "least"),

@@ -11,11 +11,11 @@ from wpdc_gwcs.exceptions import FitError
 from wpdc_gwcs.lookup._smoother import (
     MAX_DEGREE,
     Bins,
+    Smoother,
     Spectrum,
     TableChoice,
     n_terms,
     pilot_surface,
-    smooth_surface,
 )
 from wpdc_gwcs.threads import map_threads, one_blas_thread
 
@@ -258,9 +258,13 @@ def best_of(spectrum, value):
 
 def _distinct(found):
     """Keep the best few, of different kernels or lengths: neighbors in degree hardly differ."""
-    kept = {}
+    best = {}
     for c in found:
-        kept.setdefault((c.kernel, c.epsilon), c)
+        best.setdefault((c.kernel, c.epsilon), c)
+    kept = {}
+    for kind, c in best.items():
+        # All flat ones of a degree are the same.
+        kept.setdefault(c.degree if c.flat else kind, c)
     return list(kept.values())[:_N_SHORTLIST]
 
 
@@ -283,7 +287,7 @@ def _cross_validate(coarse, candidates, pilot):
         def error_of(candidate, train=train, test=test, value=value, truth=truth):
             predicted = 0.0
             if candidate.kernel != "none":
-                predicted = smooth_surface(train, value, candidate)(test.u, test.v)
+                predicted = Smoother(train, candidate)(value)(test.u, test.v)
             return np.sum((truth - predicted) ** 2 * test.weight[:, None])
 
         total += map_threads(error_of, candidates)
