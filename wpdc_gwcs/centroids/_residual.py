@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from wpdc_gwcs.centroids._fit import Stars
 from wpdc_gwcs.centroids._profile import Profile
 from wpdc_gwcs.cutouts import cut_squares
+from wpdc_gwcs.threads import count_threads, map_threads
 
 __all__ = ["Painter", "Residual", "Scene"]
 
@@ -159,17 +160,24 @@ class Scene:
         beside = np.empty((len(rows), 2 * margin + 1, 2 * margin + 1), np.float32)
         strip_of = np.clip(yc, 0, len(image) - 1)
         step = max(1, _STRIP // image.shape[1])
-        work = np.zeros((step + 2 * margin, image.shape[1]), np.float32)
-        for first in range(0, len(image), step):
-            last = min(first + step, len(image))
-            low, high = max(first - margin, 0), min(last + margin, len(image))
-            light = work[: high - low]
-            for one in models:
-                one.paint(light, first_row=low)
-            k = slice(*np.searchsorted(strip_of, [first, last]))
-            beside[k] = cut_squares(light, xc[k], yc[k] - low, margin)
-            for one in models:
-                one.take(light, image[low:high], (first - low, last - low), first_row=low)
+        firsts = range(0, len(image), step)
+
+        def draw(part):
+            # The light is zero again after each strip.
+            work = np.zeros((step + 2 * margin, image.shape[1]), np.float32)
+            for first in firsts[part::n_parts]:
+                last = min(first + step, len(image))
+                low, high = max(first - margin, 0), min(last + margin, len(image))
+                light = work[: high - low]
+                for one in models:
+                    one.paint(light, first_row=low)
+                k = slice(*np.searchsorted(strip_of, [first, last]))
+                beside[k] = cut_squares(light, xc[k], yc[k] - low, margin)
+                for one in models:
+                    one.take(light, image[low:high], (first - low, last - low), first_row=low)
+
+        n_parts = count_threads()
+        map_threads(draw, range(n_parts))
         parts = [slice(k, k + _MANY) for k in range(0, len(rows), _MANY)]
         found = [
             self._disturbed(beside[k], was.take(k), near.take(k), changed[rows[k]], radius, settled)
