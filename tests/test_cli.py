@@ -210,6 +210,25 @@ def test_bad_input_is_one_line_and_status_two(inputs, tmp_path, capsys, argument
     assert not list(tmp_path.glob("out/*"))
 
 
+def test_what_is_wrong_is_found_before_thousands_of_frames_are_read(inputs, tmp_path, capsys):
+    frames, reference = inputs
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "report.html").write_text("precious")
+    (tmp_path / "empty.fits").touch()
+    unread = tmp_path / "unread.fits"
+    unread.write_text("a frame that would be refused if it were read")
+    for options, message in (
+        (["--catalog", str(tmp_path / "none.fits")], "catalog must be an existing file"),
+        (["--catalog", str(tmp_path / "empty.fits[1]")], "catalog must not be empty"),
+        (["--catalog", reference, "--solution", str(tmp_path)], "is a folder"),
+        (["--catalog", reference, "--report", "--output", str(tmp_path / "taken")], "report.html"),
+    ):
+        out = ["--output", str(tmp_path / "out")] if "--output" not in options else []
+        assert run(["calibrate", str(unread), *options, *out]) == 2
+        assert message in error_of(capsys)
+    assert (tmp_path / "taken" / "report.html").read_text() == "precious"
+
+
 def test_options_come_from_preset_then_config_then_command_line(inputs, tmp_path, monkeypatch):
     frames, reference = inputs
     seen = []

@@ -128,6 +128,12 @@ def test_what_is_no_solution_is_refused(inputs, updated, tmp_path, capsys):
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert "--solution needs a *.solution.asdf or *.camera.asdf file" in lines[0]
+    assert run([*command, "--solution", str(updated)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    hint = f"is a folder; try --solution {updated / 'sim.solution.asdf'}"
+    assert line.endswith(hint)
+    assert run([*command, "--solution", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.strip().endswith("--solution must be a file, is a folder")
 
 
 @pytest.fixture(scope="module")

@@ -346,7 +346,7 @@ def test_executors(frames, inputs, kind):
 @dask_leaves_sockets
 def test_executor_of_dask(frames, inputs, distributed):
     with (
-        distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         run = calibrate(frames, inputs[1], executor=client.get_executor())
@@ -381,7 +381,7 @@ def test_a_scheduler_without_workers_is_given_up(inputs, tmp_path, capsys, distr
     arguments = ["calibrate", str(inputs[0][0]), "--catalog", str(inputs[1])]
     arguments += ["--output", str(tmp_path / "out"), "--scheduler-timeout", "2"]
     with distributed.LocalCluster(
-        n_workers=0, processes=False, dashboard_address=None, protocol="tcp", host="127.0.0.1"
+        n_workers=0, processes=False, dashboard_address=":0", protocol="tcp", host="127.0.0.1"
     ) as cluster:
         began = time.monotonic()
         assert command([*arguments, "--scheduler", cluster.scheduler_address]) == 2
@@ -401,7 +401,7 @@ def test_a_scheduler_without_workers_is_given_up(inputs, tmp_path, capsys, distr
 @pytest.mark.parametrize("gone", ["workers", "scheduler"])
 def test_a_cluster_that_is_lost_ends_the_run(frames, inputs, tmp_path, distributed, gone):
     cluster = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+        n_workers=1, threads_per_worker=1, dashboard_address=":0", host="127.0.0.1"
     )
     # The first frame is done, the second one ends all, and the third one waits.
     # A cluster that is closed ends its workers, and then the scheduler.

@@ -46,7 +46,7 @@ from wpdc_gwcs.catalogs.motions import fill_motions, propagate
 from wpdc_gwcs.catalogs.quality import scale_errors
 from wpdc_gwcs.catalogs.region import Region
 from wpdc_gwcs.catalogs.sources import catalog_source
-from wpdc_gwcs.catalogs.standard import identity_of, read_catalog
+from wpdc_gwcs.catalogs.standard import identity_of, read_catalog, require_catalog_file
 
 __all__ = [
     "READ_ERRORS",
@@ -61,6 +61,7 @@ __all__ = [
     "read_catalog",
     "read_lines",
     "read_table_file",
+    "require_catalog_file",
     "scale_errors",
     "select_cone",
     "special_file",

@@ -39,7 +39,7 @@ from wpdc_gwcs.columns import (
 )
 from wpdc_gwcs.exceptions import CatalogError, WPDCWarning
 
-__all__ = ["identity_of", "known_names", "read_catalog"]
+__all__ = ["identity_of", "known_names", "read_catalog", "require_catalog_file"]
 
 log = logging.getLogger(__name__)
 
@@ -249,16 +249,41 @@ def _file_identity(source):
     return f"{source} {stat.st_size} {stat.st_mtime_ns}"
 
 
+def require_catalog_file(path):
+    """Check that there is a file to read, before any work that needs it.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; it may name an extension, ``path[EXT]``.
+
+    Raises
+    ------
+    CatalogError
+        If there is nothing, something else than a file, or an empty file.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.catalogs import require_catalog_file
+    >>> require_catalog_file("no-such-file.fits")
+    Traceback (most recent call last):
+        ...
+    wpdc_gwcs.exceptions.CatalogError: no-such-file.fits: catalog must be an existing file, ...
+    """
+    path = split_extension(path)[0]
+    if not path.exists():
+        raise CatalogError(f"{path}: catalog must be an existing file, found nothing there")
+    if (what := special_file(path)) is not None:
+        raise CatalogError(f"{path}: catalog must be a file, is {what}")
+    if path.is_file() and path.stat().st_size == 0:
+        raise CatalogError(f"{path}: catalog must not be empty, the file has 0 bytes")
+
+
 def _read_table(path, format):
     """Read a table from a file; raise a `CatalogError` whatever goes wrong."""
+    require_catalog_file(path)
     path, extension = split_extension(path)
     try:
-        if not path.exists():
-            raise CatalogError(f"{path}: catalog must be an existing file, found nothing there")
-        if (what := special_file(path)) is not None:
-            raise CatalogError(f"{path}: catalog must be a file, is {what}")
-        if path.is_file() and path.stat().st_size == 0:
-            raise CatalogError(f"{path}: catalog must not be empty, the file has 0 bytes")
         # The readers warn of odd units and headers; what matters is checked later.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -273,7 +273,7 @@ def calibrate_command(
     from wpdc_gwcs.calibration import calibrate
     from wpdc_gwcs.calibration.cluster import cluster_executor
     from wpdc_gwcs.calibration.results import ERRORS
-    from wpdc_gwcs.catalogs import catalog_source
+    from wpdc_gwcs.catalogs import catalog_source, require_catalog_file
     from wpdc_gwcs.io import read_files
 
     if report:
@@ -322,16 +322,20 @@ def calibrate_command(
     keys |= {"mask": mask, "mask_bits": mask_bits, "weight_map": weight_map}
     maps = [path for path in (catalog, mask, weight_map) if path is not None]
     paths = expand_paths(frames, without=maps)
-    loaded = read_files(paths, wcs=wcs, detector=detector, **keys)
+    # Thousands of frames take minutes to read: what else may be wrong is found before.
     page = output / "report.html"
     if report:
         require_free(page, overwrite or resume)
     stored = stored_solutions(solution or [])
+    stars = catalog_source(catalog, url=tap_url, cache=cache, max_mag=max_mag)
+    if stars is catalog:
+        require_catalog_file(catalog)
     cluster = nullcontext() if scheduler is None else cluster_executor(scheduler, scheduler_timeout)
     with cluster as pool, progress_bar(quiet=quiet) as progress:
+        loaded = read_files(paths, progress=progress, wcs=wcs, detector=detector, **keys)
         run = calibrate(
             loaded,
-            catalog_source(catalog, url=tap_url, cache=cache, max_mag=max_mag),
+            stars,
             solution=stored,
             update=update,
             settings=settings,
@@ -395,6 +399,10 @@ def stored_solutions(paths):
     found, source = {}, {}
     single = None
     for path in paths:
+        if path.is_dir():
+            inside = [*sorted(path.glob("*.camera.asdf")), *sorted(path.glob("*.solution.asdf"))]
+            hint = f"; try --solution {inside[0]}" if inside else ""
+            raise InputError(f"{path}: --solution must be a file, is a folder{hint}")
         stored = read(path)
         if isinstance(stored, DistortionSolution):
             single, several = stored, {stored.detector: stored}

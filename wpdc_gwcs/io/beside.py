@@ -24,13 +24,15 @@ _MOST_WORDS = 3
 _TIMES = ("DATE-OBS", "MJD-OBS", "EXPNUM", "OBSID", "DATE-BEG", "TIME-OBS", "UTSTART")
 
 
-def read_files(paths, **options):
+def read_files(paths, *, progress=None, **options):
     """Read the frames of several files, some of which may be masks or weights of others.
 
     Parameters
     ----------
     paths : iterable of path-like
         As for `wpdc_gwcs.io.read_frames`.
+    progress : callable, optional
+        Called as ``progress("read", done, total)`` after each file.
     **options
         As for `wpdc_gwcs.io.read_frames`; an explicit mask or weight map takes precedence.
 
@@ -62,9 +64,11 @@ def read_files(paths, **options):
     >>> frame.name, int(frame.load_mask().sum())
     ('a', 1280)
     """
-    frames = []
-    for path, maps in tell_frames(paths):
+    frames, told = [], tell_frames(paths)
+    for done, (path, maps) in enumerate(told, start=1):
         frames += read_frames(path, beside=maps, **options)
+        if progress is not None:
+            progress("read", done, len(told))
     return frames
 
 
