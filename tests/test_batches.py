@@ -3,7 +3,7 @@
 import gc
 import json
 import os
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -15,13 +15,14 @@ from wpdc_gwcs import Settings, calibrate, read
 from wpdc_gwcs.calibration import batches as batches_module
 from wpdc_gwcs.calibration import results as results_module
 from wpdc_gwcs.calibration import run as run_module
+from wpdc_gwcs.calibration import solving as solving_module
 from wpdc_gwcs.calibration.batches import batches_of
 from wpdc_gwcs.calibration.journal import add_to_journal, find_journals, journal_of, read_journal
 from wpdc_gwcs.calibration.manifest import read_manifest
 from wpdc_gwcs.calibration.results import ResultFolder
 from wpdc_gwcs.cli.app import run as command
 from wpdc_gwcs.cli.inputs import expand_paths
-from wpdc_gwcs.exceptions import CatalogError, InputError, without_frames
+from wpdc_gwcs.exceptions import CatalogError, ClusterError, InputError, without_frames
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.io import read_frames, read_table
 from wpdc_gwcs.simulation import simulate, write_simulation
@@ -96,7 +97,7 @@ class Stopped(BaseException):
 
 def stop_after(monkeypatch, n):
     """End a run at its (n + 1)th solution, as a killed program does: nothing is tidied."""
-    true, calls = run_module.solve_camera, []
+    true, calls = solving_module.solve_camera, []
 
     def stopping(*args, **options):
         calls.append(1)
@@ -104,7 +105,7 @@ def stop_after(monkeypatch, n):
             raise Stopped
         return true(*args, **options)
 
-    monkeypatch.setattr(run_module, "solve_camera", stopping)
+    monkeypatch.setattr(solving_module, "solve_camera", stopping)
     monkeypatch.setattr(ResultFolder, "__exit__", lambda self, *_: os.close(self._lock))
 
 
@@ -194,13 +195,13 @@ def test_no_more_is_in_hand_than_keeps_the_workers_busy(inputs, pairs, monkeypat
     frames, reference, stored, _ = inputs
     copies = [replace(f, name=f"{f.name}-{k}") for k in range(4) for f in frames]
     solved, most = [], []
-    true = run_module.solve_camera
+    true = solving_module.solve_camera
 
     def counting(group, *args, **options):
         solved.extend(group)
         return true(group, *args, **options)
 
-    monkeypatch.setattr(run_module, "solve_camera", counting)
+    monkeypatch.setattr(solving_module, "solve_camera", counting)
 
     class Pool(ThreadPoolExecutor):
         n_workers = 2
@@ -216,6 +217,92 @@ def test_no_more_is_in_hand_than_keeps_the_workers_busy(inputs, pairs, monkeypat
     assert len(run.calibrations) == Pool.n_submitted == 24
     # Twice as many as workers, a batch more, and that which is being solved.
     assert max(most) <= 2 * 2 + 2 + 2
+
+
+def contents(folder):
+    """Data of all tables and WCS of a folder."""
+    found = {}
+    for path in sorted(folder.iterdir()):
+        if path.name.endswith(".wcs.asdf"):
+            one = read(path)
+            found[path.name] = [*one.wcs(100.0, 200.0), *one.cd.ravel()]
+        elif path.name.endswith((".matches.ecsv", ".sources.ecsv")):
+            table = read_table(path)
+            found[path.name] = np.concatenate([np.asarray(c, float) for c in table.itercols()])
+    return found
+
+
+class Pool(ThreadPoolExecutor):
+    """Threads that count what they solve, and may fail to."""
+
+    n_workers = 2
+    problem = None
+
+    def __init__(self):
+        super().__init__(2)
+        self.n_solved = 0
+
+    def submit(self, function, item):
+        if function is not solving_module.solve_or_fail:
+            return super().submit(function, item)
+        self.n_solved += 1
+        if self.problem is None:
+            return super().submit(function, item)
+        future = Future()
+        future.set_exception(self.problem)
+        return future
+
+
+@pytest.fixture(scope="module")
+def alone(inputs, tmp_path_factory):
+    """What a single process finds, batch by batch."""
+    frames, reference, stored, _ = inputs
+    folder = tmp_path_factory.mktemp("alone")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batches_module, "_MOST_EXPOSURES", 2)
+        run = calibrate(frames, reference, solution=stored, output=folder, keep=False)
+    return run, contents(folder)
+
+
+def the_same(run, folder, alone):
+    expected, data = alone
+    found = contents(folder)
+    assert list(found) == list(data)
+    for name, values in data.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-12, atol=1e-12, err_msg=name)
+    for name in ("frame", "status", "n_sources", "n_matched"):
+        assert list(run.summary[name]) == list(expected.summary[name])
+    np.testing.assert_allclose(run.summary["sigma_dx"], expected.summary["sigma_dx"], rtol=1e-9)
+    states = read_manifest(folder / "manifest.json").frames
+    assert all(states[name]["state"] == "solved" for name in expected.summary["frame"])
+
+
+@pytest.mark.parametrize("problem", [None, OSError("no room"), ClusterError("all are gone")])
+def test_batches_are_solved_by_workers_or_else_here(inputs, pairs, tmp_path, alone, problem):
+    frames, reference, stored, _ = inputs
+    with Pool() as pool:
+        pool.problem = problem
+        run = calibrate(
+            frames, reference, solution=stored, output=tmp_path, executor=pool, keep=False
+        )
+    assert pool.n_solved == 3
+    the_same(run, tmp_path, alone)
+    assert not list(tmp_path.glob(".*.part"))
+
+
+def test_batches_are_solved_by_processes(inputs, pairs, tmp_path, alone, monkeypatch):
+    frames, reference, stored, _ = inputs
+    monkeypatch.setattr(solving_module, "_solve", None)  # of this process
+    run = calibrate(frames, reference, solution=stored, output=tmp_path, jobs=2, keep=False)
+    the_same(run, tmp_path, alone)
+
+
+def test_what_is_kept_is_solved_here(inputs, pairs, tmp_path):
+    frames, reference, stored, _ = inputs
+    with Pool() as pool:
+        run = calibrate(frames[:3], reference, solution=stored, output=tmp_path, executor=pool)
+    assert pool.n_solved == 0
+    assert len(run.calibrations) == 3
 
 
 def test_calibrations_are_left_to_the_files_only_where_there_are_any(inputs):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import sep
 from numpy.testing import assert_array_equal
 from scipy import ndimage
 
@@ -140,6 +141,14 @@ def test_windows_have_the_peaks_of_the_image(masked, fwhm, rng, monkeypatch):
 def test_an_image_of_noise_has_no_windows(rng):
     background = subtract_background(rng.normal(100, 5, (400, 300)))
     assert list(_extract.search(background, 8.0, 0.002, sparse=True)) == []
+
+
+def test_sep_is_left_as_it_was(rng):
+    before = sep.get_extract_pixstack(), sep.get_sub_object_limit()
+    background = subtract_background(crowd(rng, (300, 300), 20))
+    for sparse in (False, True):
+        assert len(list(_extract.search(background, 5.0, 0.002, sparse=sparse)))
+        assert (sep.get_extract_pixstack(), sep.get_sub_object_limit()) == before
 
 
 def test_threads_change_nothing(rng, monkeypatch):

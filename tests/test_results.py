@@ -26,6 +26,7 @@ from wpdc_gwcs import Settings, calibrate, read
 from wpdc_gwcs.calibration import match_frame
 from wpdc_gwcs.calibration import results as results_module
 from wpdc_gwcs.calibration import run as run_module
+from wpdc_gwcs.calibration import solving as solving_module
 from wpdc_gwcs.calibration.cluster import cluster_executor
 from wpdc_gwcs.calibration.manifest import frame_sum, read_manifest
 from wpdc_gwcs.calibration.results import ResultFolder
@@ -134,14 +135,14 @@ class Stopped(BaseException):
 
 def stop_at(monkeypatch, detector):
     """Stop a run when it comes to a detector, as a signal would."""
-    true = run_module.solve_camera
+    true = solving_module.solve_camera
 
     def stopping(group, *args, **options):
         if group[0].detector == detector:
             raise Stopped
         return true(group, *args, **options)
 
-    monkeypatch.setattr(run_module, "solve_camera", stopping)
+    monkeypatch.setattr(solving_module, "solve_camera", stopping)
 
 
 def test_a_stop_loses_only_what_was_in_work(frames, inputs, tmp_path, monkeypatch):
@@ -276,8 +277,8 @@ def test_what_nobody_foresaw_is_the_failure_of_one_frame(frames, inputs, tmp_pat
 
 
 def test_what_nobody_foresaw_in_a_solution(frames, inputs, tmp_path, monkeypatch):
-    monkeypatch.setattr(run_module, "_camera_of", None)
-    monkeypatch.setattr(run_module, "solve_camera", lambda group, *a, **o: boom())
+    monkeypatch.setattr(solving_module, "_camera_of", None)
+    monkeypatch.setattr(solving_module, "solve_camera", lambda group, *a, **o: boom())
     run = calibrate(frames, inputs[1], output=tmp_path)
     assert len(run.failures) == 3
     assert all(isinstance(error, InternalError) for error in run.failures.values())

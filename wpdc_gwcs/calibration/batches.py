@@ -7,11 +7,32 @@
 
 from wpdc_gwcs.calibration.camera import cameras_of, exposure_key
 
-__all__ = ["batches_of"]
+__all__ = ["are_independent", "batches_of"]
 
 # Exposures of a camera whose distortion is known that are solved together: enough to tell how much
 # scale and rotation vary between them, few enough that the memory of a run is that of a night.
 _MOST_EXPOSURES = 16
+
+
+def are_independent(settings, *, solution, update):
+    """Return whether exposures of a known camera have nothing to tell each other.
+
+    Parameters
+    ----------
+    settings : Settings
+        Choices.
+    solution : DistortionSolution, mapping or None
+        Stored solutions.
+    update : bool
+        Whether they are updated.
+
+    Returns
+    -------
+    bool
+        False without a stored solution, and where all exposures are tied together.
+    """
+    tied = update or settings.free_stars or settings.method == "paper"
+    return solution is not None and not tied
 
 
 def batches_of(frames, settings, *, solution=None, update=False, earlier=()):
@@ -39,7 +60,7 @@ def batches_of(frames, settings, *, solution=None, update=False, earlier=()):
         first, as they were.
     """
     cameras = cameras_of(frames)
-    if solution is None or update or settings.free_stars or settings.method == "paper":
+    if not are_independent(settings, solution=solution, update=update):
         return cameras
     earlier = [set(names) for names in earlier]
     return [batch for camera in cameras for batch in _split(camera, solution, earlier)]

@@ -14,6 +14,7 @@ import contextlib
 import logging
 import threading
 import time
+import warnings
 from concurrent.futures import Executor, Future
 from functools import partial
 
@@ -121,7 +122,10 @@ class _WatchedExecutor(Executor):
             if self._error is not None:
                 raise self._error
             self._waiting.add(future)
-        inner = self._pool.submit(fn, *args, **kwargs)
+        with warnings.catch_warnings():
+            # Frames that have been matched together are some 10 MB, from which on Dask warns.
+            warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
+            inner = self._pool.submit(fn, *args, **kwargs)
         inner.add_done_callback(partial(self._pass_on, future))
         return future
 

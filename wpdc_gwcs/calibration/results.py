@@ -27,7 +27,7 @@ from wpdc_gwcs.calibration.summary import summarize
 from wpdc_gwcs.exceptions import InputError
 from wpdc_gwcs.threads import one_blas_thread
 
-__all__ = ["ERRORS", "Outcome", "ResultFolder"]
+__all__ = ["ERRORS", "Outcome", "ResultFolder", "with_files"]
 
 #: File with the details of internal errors.
 ERRORS = "errors.log"
@@ -54,6 +54,10 @@ class Outcome:
         Cameras of the detectors that were solved together.
     rows : list of dict
         Rows of the summary, one for each frame.
+    n_fields : int
+        How many frames have a field of their own.
+    files : dict
+        Bytes by file name, by frame name, of the frames whose files a worker has made.
     """
 
     calibrations: list = field(default_factory=list)
@@ -62,6 +66,8 @@ class Outcome:
     failures: dict = field(default_factory=dict)
     cameras: list = field(default_factory=list)
     rows: list = field(default_factory=list)
+    n_fields: int = 0
+    files: dict = field(default_factory=dict)
 
 
 class ResultFolder:
@@ -411,13 +417,18 @@ class ResultFolder:
 
     def _write_into(self, part, group, outcome, workers):
         """Write results into a folder: files of each frame, and shared files."""
-        from wpdc_gwcs.io import write
+        from wpdc_gwcs.io import atomic_path, write
 
         run = self._manifest.run
         files = {frame.name: [] for frame in group}
         written = workers.map(partial(_write_frame, part, run), outcome.calibrations)
         for calibration, names in zip(outcome.calibrations, written, strict=True):
             files[calibration.frame] = names
+        for frame, made in outcome.files.items():
+            for name, content in made.items():
+                with atomic_path(part / name) as temporary:
+                    temporary.write_bytes(content)
+            files[frame] = list(made)
         # Shared files; with a stored solution they are the same in all batches.
         shared = {f"{file_stem(s.detector)}.solution.asdf": s for s in outcome.solutions.values()}
         shared |= {superseded_name(s): s for s in outcome.superseded.values()}
@@ -463,6 +474,32 @@ class ResultFolder:
         with path.open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{self._manifest.run} {name}: {error}\n{error.details}\n")
         return path
+
+
+def with_files(outcome, run):
+    """Make the files of frames, for a process that has no tables to make them from.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        Results of the frames.
+    run : str
+        Identity of the run.
+
+    Returns
+    -------
+    Outcome
+        The same with the bytes of the files in place of the calibrations.
+    """
+    files = {}
+    with tempfile.TemporaryDirectory(prefix="wpdc-") as folder:
+        for calibration in outcome.calibrations:
+            paths = [Path(folder) / name for name in _write_frame(Path(folder), run, calibration)]
+            files[calibration.frame] = {path.name: path.read_bytes() for path in paths}
+            # The folder needs no more room than a frame.
+            for path in paths:
+                path.unlink()
+    return replace(outcome, calibrations=[], files=files)
 
 
 @one_blas_thread

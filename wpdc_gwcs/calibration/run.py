@@ -14,13 +14,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from astropy.table import QTable
 
-from wpdc_gwcs.calibration.batches import batches_of
-from wpdc_gwcs.calibration.camera import cameras_of, solve_camera
+from wpdc_gwcs.calibration.batches import are_independent, batches_of
 from wpdc_gwcs.calibration.exposures import tie_exposures
 from wpdc_gwcs.calibration.manifest import plan_run
 from wpdc_gwcs.calibration.matched import FailedFrame
-from wpdc_gwcs.calibration.results import Outcome, ResultFolder
+from wpdc_gwcs.calibration.results import ResultFolder
 from wpdc_gwcs.calibration.settings import Settings
+from wpdc_gwcs.calibration.solving import Batch, solve_or_fail
 from wpdc_gwcs.calibration.story import (
     say,
     tell_catalog,
@@ -28,10 +28,9 @@ from wpdc_gwcs.calibration.story import (
     tell_outcome,
     tell_result,
 )
-from wpdc_gwcs.calibration.summary import summarize, summary_row
+from wpdc_gwcs.calibration.summary import summarize
 from wpdc_gwcs.calibration.work import Run, begin_group, match_group, sky_of_frames
-from wpdc_gwcs.calibration.workers import Workers, internal_error, stored_of
-from wpdc_gwcs.camera import build_camera
+from wpdc_gwcs.calibration.workers import Workers, stored_of
 from wpdc_gwcs.catalogs import (
     catalog_source,
     fill_motions,
@@ -45,8 +44,6 @@ from wpdc_gwcs.exceptions import (
     DuplicateFrameError,
     FitError,
     InternalError,
-    WPDCError,
-    without_frames,
 )
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.frozen import freeze_attributes
@@ -60,6 +57,8 @@ log = logging.getLogger(__name__)
 # Models and their parameters refer to each other.  Their tables, a megabyte for a frame, would wait
 # for a search for cycles, which a few large objects never set off; it takes the time of one frame.
 _FRAMES_PER_SEARCH = 100
+# Frames that may wait for their solutions by workers, about a megabyte each.
+_MOST_SOLVING = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,14 +264,17 @@ def calibrate(
                 update=update,
             )
             run_id = folder.begin(groups, plan).run
-        run = Run(frames, catalog, solution, settings, update, progress)
+        # Of batches that depend on nothing else, workers make the files too.
+        remote = not keep and are_independent(settings, solution=solution, update=update)
+        run = Run(frames, catalog, solution, settings, update, progress, run_id if remote else None)
         done = [group for group in groups if folder is not None and folder.is_done(group)]
         outcomes = {group[0].name: folder.load(group, keep=keep) for group in done}
         todo = [group for group in groups if group[0].name not in outcomes]
         jobs = min(jobs, sum(map(len, todo)))
         with Workers(jobs, executor) as workers:
             for group, outcome in _outcomes(todo, run, workers):
-                outcomes[group[0].name] = outcome if keep else replace(outcome, calibrations=[])
+                kept = outcome if keep else replace(outcome, calibrations=[], files={})
+                outcomes[group[0].name] = kept
                 for name, error in outcome.failures.items():
                     _log_details(name, error, folder)
                 if folder is not None:
@@ -318,7 +320,7 @@ def _outcomes(groups, run, workers):
     other = _of_other_detectors(run.frames, run.solution)
     counter, n_frames, n_past = itertools.count(1), sum(map(len, groups)), 0
     run.progress("match", 0, n_frames)
-    waiting, begun, lost = deque(groups), deque(), None
+    waiting, begun, solving, lost = deque(groups), deque(), deque(), None
 
     def begin():
         """Start the matching of the next groups, at least one."""
@@ -345,82 +347,84 @@ def _outcomes(groups, run, workers):
                 say(tell_result, frames[name], results[name], run.settings)
                 run.progress("match", next(counter), n_frames)
                 begin()
-            run.progress("solve", k, len(groups))
-            announce("solution")
-            began = time.perf_counter()
-            outcome = _outcome_of(work, results, run, None if other else workers)
-            say(tell_outcome, outcome, time.perf_counter() - began)
+            batch = _batch_of(work, results, run, None if other else workers)
         except ClusterError as err:
             lost = lost or err
             continue
         finally:
             begun.popleft()
-        yield work.group, outcome
-        n_past += len(work.group)
-        del work, results, outcome
-        if n_past >= _FRAMES_PER_SEARCH:
-            n_past = 0
-            gc.collect()
+        solving.append(_Solving(batch, workers if run.remote else None))
+        del work, results, batch
+        while solving and (solving[0].is_done() or _too_many(solving, workers)):
+            run.progress("solve", k, len(groups))
+            n_past += len(solving[0].batch.frames)
+            yield solving.popleft().answer()
+            if n_past >= _FRAMES_PER_SEARCH:
+                n_past = 0
+                gc.collect()
+    while solving:
+        yield solving.popleft().answer()
     if lost is not None:
         raise lost
     run.progress("solve", len(groups), len(groups))
 
 
-def _outcome_of(work, results, run, workers):
-    """Match frames that could not be matched alone, and solve."""
-    group = work.group
-    try:
-        if workers is not None:
+def _batch_of(work, results, run, workers):
+    """Match frames that could not be matched alone; all that the solution of the group needs."""
+    group, problem = work.group, None
+    if workers is not None:
+        try:
             results = match_group(work, results, run, workers)
-        return _solve_group(work, results, run)
-    except ClusterError:
-        raise
-    except Exception as problem:  # noqa: BLE001  One camera is not to end the run of all.
-        error = problem if isinstance(problem, WPDCError) else internal_error(problem)
-        without_frames(error)
-        return Outcome(
-            failures={frame.name: error for frame in group},
-            rows=[summary_row(f, results[f.name], None, error, run.settings) for f in group],
-        )
-
-
-def _solve_group(work, results, run):
-    """Solve frames that have been matched, camera by camera."""
-    group, solution = work.group, run.solution
-    outcome = Outcome()
-    outcome.failures.update({n: r.error for n, r in results.items() if isinstance(r, FailedFrame)})
-    matched = [r for r in results.values() if not isinstance(r, FailedFrame)]
-    holdout = None if work.catalog is None else _holdout_mask(work.catalog, run.settings)
-    calibrations = {}
-    for camera in cameras_of(matched):
-        stored = {
-            name: stored_of(solution, name)
-            for name in {frame.detector for frame in camera}
-            if stored_of(solution, name) is not None
-        }
-        solved, found, failed = solve_camera(
-            camera, run.settings, holdout=holdout, solution=stored, update=run.update
-        )
-        outcome.solutions.update(solved)
-        for name, one in solved.items():
-            if name in stored and one.valid_from != stored[name].valid_from:
-                outcome.superseded[name] = replace(stored[name], valid_to=one.valid_from)
-        if len(solved) > 1:
-            outcome.cameras.append(_camera_of(camera, solved, found))
-        calibrations.update({c.frame: c for c in found})
-        outcome.failures.update({name: without_frames(error) for name, error in failed.items()})
-    outcome.calibrations.extend(calibrations[f.name] for f in group if f.name in calibrations)
-    outcome.rows.extend(
-        summary_row(
-            f,
-            results[f.name],
-            calibrations.get(f.name),
-            outcome.failures.get(f.name),
-            run.settings,
-        )
-        for f in group
+        except ClusterError:
+            raise
+        except Exception as error:  # noqa: BLE001  One camera is not to end the run of all.
+            problem = error
+    return Batch(
+        group,
+        results,
+        settings=run.settings,
+        solution={f.detector: stored_of(run.solution, f.detector) for f in group},
+        update=run.update,
+        holdout=None if work.catalog is None else _holdout_mask(work.catalog, run.settings),
+        problem=problem,
+        run=run.remote,
     )
-    return outcome
+
+
+class _Solving:
+    """A batch that is being solved: by a worker, or here when its answer is asked for."""
+
+    def __init__(self, batch, workers):
+        self.batch = batch
+        self._began = time.perf_counter()
+        self._future = None if workers is None else workers.start(solve_or_fail, batch.alone())
+
+    def is_done(self):
+        return self._future is None or self._future.done()
+
+    def answer(self):
+        """Frames and their outcome."""
+        announce("solution")
+        outcome, batch = None, self.batch
+        if self._future is not None:
+            try:
+                outcome = self._future.result()
+            except Exception as problem:  # noqa: BLE001  Such as the death of a worker.
+                log.info(
+                    "solution: %s could not be solved by a worker, and are solved here: %s",
+                    counted(len(batch.frames), "frame"), problem,
+                )  # fmt: skip
+                self._began = time.perf_counter()
+        if outcome is None:
+            outcome = solve_or_fail(replace(batch, run=None))
+        say(tell_outcome, outcome, time.perf_counter() - self._began)
+        return batch.frames, outcome
+
+
+def _too_many(solving, workers):
+    """Whether as many batches are being solved as keep the workers busy, or the memory holds."""
+    n_frames = sum(len(one.batch.frames) for one in solving)
+    return len(solving) > workers.in_hand or n_frames > _MOST_SOLVING
 
 
 def _log_details(name, error, folder):
@@ -485,17 +489,6 @@ def _named_apart(frames):
         else frame
         for frame in frames
     ]
-
-
-def _camera_of(group, solutions, calibrations):
-    """Camera of the detectors of a group, by the exposures that they share."""
-    exposures = {}
-    frames = {f.name: f for f in group}
-    for c in calibrations:
-        exposures.setdefault(frames[c.frame].exposure or c.frame, []).append(c)
-    name = next((f.camera for f in group if f.camera), "camera")
-    first = next(iter(solutions.values()))
-    return build_camera(name, list(exposures.values()), solutions, provenance=first.provenance)
 
 
 def _holdout_mask(catalog, settings):

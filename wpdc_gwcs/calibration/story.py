@@ -232,11 +232,10 @@ def tell_outcome(outcome, seconds):
     list of str
         A line for each detector, and one for the frames.
     """
-    fields = sum(c.field is not None for c in outcome.calibrations)
     states = Counter(row["status"] for row in outcome.rows)
     told = ", ".join(f"{states[s]} {s}" for s in ("solved", "degraded", "failed") if states[s])
     return [
         *(f"solution: {tell_solution(one)}" for one in outcome.solutions.values()),
-        f"solution: {counted(len(outcome.rows), 'frame')}: {told}; {fields} with a field of their "
-        f"own ({seconds:.1f} s)",
+        f"solution: {counted(len(outcome.rows), 'frame')}: {told}; {outcome.n_fields} with a "
+        f"field of their own ({seconds:.1f} s)",
     ]

@@ -67,6 +67,9 @@ class Run:
         Whether stored solutions are updated.
     progress : callable
         As for `calibrate`.
+    remote : str or None
+        Identity of the run if workers solve its batches and make their files; None if they are
+        solved here.
     """
 
     frames: list
@@ -75,6 +78,7 @@ class Run:
     settings: Settings
     update: bool
     progress: Callable
+    remote: str | None = None
 
     def catalog_of(self, group):
         """Return the reference stars of frames that are solved together.

@@ -17,7 +17,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Mapping
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
@@ -243,6 +243,39 @@ class Workers:
         self._futures.add(future)
         return partial(self._outcome, future)
 
+    def start(self, function, item):
+        """Start any work that can be handed to another process.
+
+        Parameters
+        ----------
+        function : callable
+            Of one item, at the top of a module.
+        item : object
+            The item.
+
+        Returns
+        -------
+        concurrent.futures.Future or None
+            Its result; None if there are no workers.
+        """
+        try:
+            if self._threads is not None:
+                future = self._threads.submit(self._call, function, item)
+            elif self._executor is not None:
+                future = self._executor.submit(function, item)
+            else:
+                return None
+        except Exception as problem:  # noqa: BLE001  The future has the problem.
+            future = Future()
+            future.set_exception(problem)
+        self._futures.add(future)
+        future.add_done_callback(self._futures.discard)
+        return future
+
+    def _call(self, function, item):
+        """Call a function in the process of this thread."""
+        return _result_of(self._ask(ForkingPickler.dumps((function, item))))
+
     def _outcome(self, future):
         try:
             answer = future.result()
@@ -281,12 +314,9 @@ class Workers:
         """
         if self._threads is None or self._futures or len(items) < 2:
             return [function(item) for item in items]
-        futures = [
-            self._threads.submit(lambda item: self._ask(ForkingPickler.dumps((function, item))), i)
-            for i in items
-        ]
+        futures = [self._threads.submit(self._call, function, item) for item in items]
         try:
-            return [_result_of(future.result()) for future in futures]
+            return [future.result() for future in futures]
         finally:
             for future in futures:
                 future.cancel()

@@ -30,6 +30,8 @@ _ROOM, _ROOM_IN_WINDOW = 300_000, 1000
 _BY_CHANCE = 0.03
 # One in this many rows is used to estimate the number of pixels of sources.
 _SAMPLED = 4
+# Branches of a source that sep can hold.
+_BRANCHES = 8192
 
 # Share of an image from which on windows about what is high would be no less work than all of it.
 _CROWDED = 0.15
@@ -85,8 +87,6 @@ def search(background, threshold, deblend_contrast, fwhm=0.0, *, sparse=False):
     found : structured array
         As from `sep.extract`, in pixels of the strip.
     """
-    # sep's defaults are for small images: it gives up where more pixels or branches are active.
-    sep.set_sub_object_limit(8192)
     line = _line(fwhm)
     options = {
         "thresh": threshold * (line**2).sum(),
@@ -145,8 +145,16 @@ def _extract_in_windows(strip, cells, options):
 
 def _call_sep(image, rms, mask, room, options):
     """Extract the peaks of an image, with room for so many pixels of sources."""
+    before = sep.get_extract_pixstack(), sep.get_sub_object_limit()
     sep.set_extract_pixstack(room)
-    return sep.extract(image, err=rms, mask=mask, minarea=3, filter_type="conv", **options)
+    # The default is for small images: sep gives up where more branches are active.
+    sep.set_sub_object_limit(_BRANCHES)
+    try:
+        return sep.extract(image, err=rms, mask=mask, minarea=3, filter_type="conv", **options)
+    finally:
+        # Others may use sep too.
+        sep.set_extract_pixstack(before[0])
+        sep.set_sub_object_limit(before[1])
 
 
 def _shift(found, dx, dy):
