@@ -69,7 +69,9 @@ def cluster_executor(address, timeout):
             "--scheduler needs Dask, which is not installed: pip install 'wpdc_gwcs[dask]'"
         ) from err
     # Messages of Dask about lost connections are suppressed; the outcome is reported here.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    # Its configuration gives the second logger a level of its own.
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     began = time.monotonic()
     try:
         client = Client(address, timeout=timeout)
