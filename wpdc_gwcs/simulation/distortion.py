@@ -38,11 +38,11 @@ class Distortion:
     With :math:`z = (x - x_0 + i (y - y_0)) / h` and :math:`a` the axis, a detector pixel moves by
 
     .. math::
-        D(z) = (z - a)(k_3 |z - a|^2 + k_5 |z - a|^4) + \sum_{m+n=2}^{6} c_{mn} z^m \bar z^n
-               - T_1(z) + \sum_j A_j \sin(\mathrm{Re}\,\bar\kappa_j z + \phi_j)
+        D(z) = R(z) - T_1(z) + \sum_{m+n=2}^{6} c_{mn} z^m \bar z^n
+               + \sum_j A_j \sin(\mathrm{Re}\,\bar\kappa_j z + \phi_j)
 
-    where :math:`T_1` is the constant and linear part of the radial term at the center, which is in
-    the linear WCS.  The inverse is Newton's iteration with the Wirtinger derivatives
+    with the radial term :math:`R(z) = (z - a)(k_3 |z - a|^2 + k_5 |z - a|^4)`, whose constant and
+    linear part at the center, :math:`T_1`, is in the linear WCS.  The inverse is Newton's iteration with the Wirtinger derivatives
     :math:`D_z, D_{\bar z}`.
 
     Examples
