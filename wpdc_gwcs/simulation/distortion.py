@@ -42,8 +42,8 @@ class Distortion:
                + \sum_j A_j \sin(\mathrm{Re}\,\bar\kappa_j z + \phi_j)
 
     with the radial term :math:`R(z) = (z - a)(k_3 |z - a|^2 + k_5 |z - a|^4)`, whose constant and
-    linear part at the center, :math:`T_1`, is in the linear WCS.  The inverse is Newton's iteration with the Wirtinger derivatives
-    :math:`D_z, D_{\bar z}`.
+    linear part at the center, :math:`T_1`, is in the linear WCS.  The inverse is Newton's iteration
+    with the Wirtinger derivatives :math:`D_z, D_{\bar z}`.
 
     Examples
     --------
