@@ -1,4 +1,4 @@
-"""The focal plane of a camera as the headers have it, common to all its exposures.
+"""The focal plane of a camera according to its headers, common to all exposures.
 
 ::
 
@@ -15,7 +15,8 @@ from wpdc_gwcs.models import deproject, project
 
 __all__ = ["NODES", "FocalPlane", "focal_planes", "node_pixels"]
 
-# Where frames are compared: a grid that tells a quadratic from a linear displacement.
+# Positions where frames are compared: a grid that distinguishes a quadratic displacement from a
+# linear one.
 NODES = 0.8 * np.array([(i, j) for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0)])
 # Headers whose geometries differ by more than this, px, are not those of one camera.
 _DIFFERENT = 30.0
@@ -32,20 +33,20 @@ class _Exposure:
 
 @dataclass(frozen=True, eq=False)
 class FocalPlane:
-    """Frames whose header geometry is one camera's, up to a linear mapping per exposure.
+    """Frames whose headers have the same camera geometry, up to a linear mapping per exposure.
 
     Parameters
     ----------
     frames : dict
-        Frame name to frame.
+        Frames by name.
     exposures : dict
-        Exposure to its tangent point and mapping of the header plane.
+        Tangent point of each exposure, and its linear mapping to the focal plane.
     centers : dict
-        Detector to its center in the focal plane, px.
+        Center of each detector in the focal plane, px.
     halves : dict
-        Detector to half of its diagonal, px.
+        Half diagonal of each detector, px.
     scale : float
-        Degrees per px.
+        Pixel scale, deg / px.
     radius : float
         Radius of the camera, px.
     """
@@ -58,35 +59,35 @@ class FocalPlane:
     radius: float
 
     def of(self, exposure):
-        """Focal plane of a single exposure.
+        """Return the focal plane of a single exposure.
 
         Parameters
         ----------
         exposure : str
-            One of the exposures.
+            Key of the exposure.
 
         Returns
         -------
         FocalPlane
-            With its frames alone.
+            The same focal plane with only the frames of this exposure.
         """
         frames = {n: f for n, f in self.frames.items() if f.exposure == exposure}
         return replace(self, frames=frames, exposures={exposure: self.exposures[exposure]})
 
     def header_place(self, frame, x, y):
-        """Focal plane position of pixels by the header.
+        """Return the focal plane position of pixels according to the header.
 
         Parameters
         ----------
         frame : Frame
             One of the frames.
         x, y : (N,) array_like
-            Pixels.
+            Pixels, zero based.
 
         Returns
         -------
         (N, 2) ndarray
-            Position, px.
+            Positions, px.
         """
         exposure = self.exposures[frame.exposure]
         plane = np.column_stack(project(*sky_of(frame.wcs, x, y), exposure.crval)) / self.scale
@@ -94,17 +95,17 @@ class FocalPlane:
 
 
 def focal_planes(frames):
-    """Sort the frames of a camera into focal planes whose headers agree.
+    """Group the frames of a camera into focal planes whose headers agree.
 
     Parameters
     ----------
     frames : list of Frame
-        Of one camera, with exposures.
+        Frames of one camera; each belongs to an exposure.
 
     Returns
     -------
     list of FocalPlane
-        One as a rule; several where exposures have no detector in common or another geometry.
+        Usually one; several if exposures have no detector in common, or a different geometry.
     """
     exposures, planes = {}, []
     for frame in frames:
@@ -159,7 +160,7 @@ def _header_mapping(nodes, focal, scale):
     """Linear mapping of an exposure's header plane to the focal plane; `None` if it has none."""
     to = np.concatenate(focal)
     crval = _mean_direction(nodes)
-    # twice: the plane must touch the sky where the first exposure's does, or it is another plane
+    # Repeated: the plane has to touch the sky at the same point as that of the first exposure.
     for _ in range(3):
         plane = np.concatenate([np.column_stack(project(*n, crval)) for n in nodes]) / scale
         design = np.column_stack([np.ones(len(plane)), plane])
@@ -178,7 +179,7 @@ def _header_mapping(nodes, focal, scale):
 
 
 def node_pixels(frame):
-    """Pixels of the nodes of a frame.
+    """Return the pixels of the nodes of a frame.
 
     Parameters
     ----------
@@ -188,7 +189,7 @@ def node_pixels(frame):
     Returns
     -------
     x, y : (9,) ndarray
-        Zero based.
+        Pixels, zero based.
     """
     ny, nx = frame.image_shape
     return 0.5 * (nx - 1) + 0.5 * nx * NODES[:, 0], 0.5 * (ny - 1) + 0.5 * ny * NODES[:, 1]
@@ -203,7 +204,7 @@ def _mean_direction(nodes):
 def _pixel_scale(frame, nodes, crval):
     plane = np.column_stack(project(*nodes, crval))
     pixels = np.column_stack(node_pixels(frame))
-    # corners and middles of the sides: two steps that span the detector
+    # The vectors between the middles of opposite sides span the detector.
     steps = np.array([plane[7] - plane[1], plane[5] - plane[3]])
     sizes = np.array([pixels[7] - pixels[1], pixels[5] - pixels[3]])
     return float(np.sqrt(abs(np.linalg.det(steps) / np.linalg.det(sizes))))

@@ -1,4 +1,4 @@
-"""Geometry of a camera from the detectors that are matched: where the others must be.
+"""Geometry of a camera from its matched detectors, to predict the positions of the others.
 
 ::
 
@@ -6,11 +6,11 @@
           --smooth field of the camera + place of the detector--> true focal plane
           --linear, per exposure--> tangent plane --> sky
 
-The header's geometry is common to all exposures of a camera, up to a linear mapping.  What it lacks
-is a polynomial of the focal plane (the optics), three numbers per axis for each detector (its
-place) and three per axis for each exposure (pointing, rotation, scale).  All of them are found
-together from the matched frames, each with a Gaussian prior whose width is learned from the data,
-so that a prediction has an error: small between matched detectors, growing outward.
+The header's geometry is common to all exposures of a camera, up to a linear mapping.  It lacks a
+polynomial of the focal plane (the optics), three numbers per axis for each detector (its place),
+and three per axis for each exposure (pointing, rotation, scale).  All of them are fitted together
+to the matched frames, each with a Gaussian prior whose width is learned from the data.  So each
+prediction has an error, which is small between matched detectors and grows outward.
 """
 
 from dataclasses import dataclass
@@ -23,23 +23,23 @@ from wpdc_gwcs.models import deproject, project
 
 __all__ = ["Geometry", "LocalPairs", "Prediction", "fit_geometry"]
 
-# Degree of the field: cameras bend by r^3 to r^7.
+# Degree of the field: the distortion of cameras has terms from r^3 to r^7.
 _DEGREE = 7
 _TERMS = [(d - j, j) for d in range(2, _DEGREE + 1) for j in range(d + 1)]
 _TERM_DEGREE = np.array([i + j for i, j in _TERMS])
-# Widths of the priors before anything is known: displacement at the rim by degree, as a share of
-# the radius of the camera (raw headers of prime-focus cameras are off by up to 5 % there);
-# places of detectors in px and turns and stretches as a share; the linear part of an exposure as a
-# share of the radius.
+# Widths of the priors before anything is learned: displacement at the edge by degree, as a fraction
+# of the radius of the camera (raw headers of prime-focus cameras are off by up to 5 % there);
+# places of detectors in px, and their rotations and stretches; pointing of an exposure in px, and
+# its linear part as a fraction of the radius.
 _FIELD = {2: 0.01, 3: 0.03, 4: 0.01, 5: 0.01, 6: 0.005, 7: 0.005}
 _PLACE, _TURN = 20.0, 1e-3
 _POINTING, _ATTITUDE = 1e4, 0.05
-# What no smooth field explains within a detector, px: more is a frame in the wrong place.
+# Noise that a smooth field leaves within a detector, px: more means a frame in the wrong place.
 _LEAST_NOISE, _MOST_NOISE = 0.1, 3.0
 _FIRST_NOISE = 1.0
-# Pairs from which on nodes stand for them, which a quadratic polynomial reaches safely.
+# Number of pairs above which nodes replace them: enough for a safe quadratic polynomial.
 _FOR_NODES = 30
-# Scatter of pairs, px: not less than round-off, nor than curvature that few pairs do not show.
+# Minimum scatter of pairs, px: rounding, and for few pairs the curvature that they do not show.
 _LEAST_SCATTER, _SCATTER_OF_FEW = 0.02, 0.3
 # Frames that deviate by more standard errors than this count less.
 _DOUBTFUL = 4.0
@@ -48,7 +48,15 @@ _ROUNDS_OF_VARIANCES = 6
 
 @dataclass(frozen=True, eq=False)
 class LocalPairs:
-    """Pairs of a matched frame: pixels and sky."""
+    """Pairs of a matched frame.
+
+    Parameters
+    ----------
+    x, y : (N,) ndarray
+        Pixels of the sources, zero based.
+    ra, dec : (N,) ndarray
+        Positions of the reference stars, deg.
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -58,16 +66,17 @@ class LocalPairs:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Where a frame is by the other frames of its camera: a WCS, and how wrong it may be.
+    """The WCS of a frame as predicted from the other frames of its camera, with its error.
 
     Parameters
     ----------
     geometry : Geometry
-        What was found.
+        Geometry of the camera.
     frame : Frame
         The frame.
     shift, bend : float
-        Errors of the place as a whole and of the turn and stretch within the frame, px, 1 sigma.
+        Standard errors in px: of the position of the frame as a whole, and of its rotation and
+        stretch at the corners.
     """
 
     geometry: "Geometry"
@@ -76,7 +85,7 @@ class Prediction:
     bend: float
 
     def pixel_to_world_values(self, x, y):
-        """Sky position of pixels.
+        """Return the sky positions of pixels.
 
         Parameters
         ----------
@@ -98,28 +107,30 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What the matched frames say of a camera.
+    """Geometry of a camera, fitted to its matched frames.
 
     Parameters
     ----------
     plane : FocalPlane
-        The frames.
+        Focal plane of the headers, with all frames.
     attitudes : dict
-        Exposure to the linear mapping (offset, matrix) from tangent to true focal plane.
+        Linear mapping (offset, matrix) of each exposure from the tangent plane to the true focal
+        plane.
     field : (n_terms, 2) ndarray
         Coefficients of the smooth field, px.
     places : dict
-        Detector to the coefficients (3, 2) of its place, px.
+        Coefficients (3, 2) of the place of each detector, px.
     widths : Widths
-        Priors as learned.
+        Learned widths of the priors.
     deviations : dict
-        Matched frame to how far it is from where the others predict it: (sigma, px).
+        Deviation of each matched frame from the prediction of the others, in standard errors and
+        in px.
     covariance : (n, n) ndarray
-        Of all unknowns of one axis, px2.
+        Covariance of all unknowns of one axis, px^2.
     columns : dict
-        Where the unknowns of exposures and detectors are.
+        Columns of the unknowns of exposures and detectors.
     linear : dict
-        Exposure to the mapping about which the attitude was linearized.
+        Mapping of each exposure about which its attitude was linearized.
     """
 
     plane: FocalPlane
@@ -133,26 +144,26 @@ class Geometry:
     linear: dict
 
     def true_place(self, frame, x, y):
-        """Focal plane position of pixels, distortion and place of the detector corrected.
+        """Return the true focal plane position of pixels, with field and place corrected.
 
         Parameters
         ----------
         frame : Frame
             One of the frames.
         x, y : (N,) array_like
-            Pixels.
+            Pixels, zero based.
 
         Returns
         -------
         (N, 2) ndarray
-            Position, px.
+            Positions, px.
         """
         at = self.plane.header_place(frame, x, y)
         place = _place_terms(self.plane, frame.detector, at) @ self.places[frame.detector]
         return at + _field_terms(self.plane, at) @ self.field + place
 
     def predict(self, frame):
-        """Predict where a frame is; `None` if nothing is known of its exposure.
+        """Predict the WCS of a frame from the other frames.
 
         Parameters
         ----------
@@ -162,7 +173,7 @@ class Geometry:
         Returns
         -------
         Prediction or None
-            With its errors.
+            Prediction with its errors; `None` if no frame of its exposure is matched.
         """
         if frame.exposure not in self.attitudes:
             return None
@@ -177,13 +188,23 @@ class Geometry:
         common = max(float(s.mean()), 0.0)
         bend = max(float(np.trace(s)) / len(s) - common, 0.0)
         noise = self.widths.noise**2
-        # the corners are 1.5 times as far out as the rms of the nodes
+        # The corners are 1.5 times as far out as the nodes (rms).
         return Prediction(self, frame, np.sqrt(common + noise), 1.5 * np.sqrt(bend + noise))
 
 
 @dataclass(frozen=True)
 class Widths:
-    """Standard deviations of the priors, px: field by degree, places, turns, noise."""
+    """Standard deviations of the priors.
+
+    Parameters
+    ----------
+    field : tuple of float
+        Field for each degree, px.
+    place, turn : float
+        Shifts, and rotations and stretches at the edge, of detectors, px.
+    noise : float
+        Noise of a frame, px.
+    """
 
     field: tuple
     place: float
@@ -232,22 +253,22 @@ class _Part:
     residual: np.ndarray = None
 
     def weights(self, noise):
-        # the noise is that of the frame as a whole: many rows tell no more of it than three
+        # The noise is common to the whole frame, so many rows count no more than three.
         common = max(1.0, len(self.at) / 3) * noise**2
         return 1 / (self.doubt * np.sqrt(self.variance + common))
 
 
 def fit_geometry(plane, pairs, before=None):
-    """Find the geometry of a camera from matched frames.
+    """Fit the geometry of a camera to its matched frames.
 
     Parameters
     ----------
     plane : FocalPlane
-        The frames.
+        Focal plane of the headers, with all frames.
     pairs : dict
-        Frame name to `LocalPairs` of the matched ones.
+        `LocalPairs` of each matched frame, by name.
     before : Geometry, optional
-        What was found from fewer frames: its widths are the first ones.
+        Result for fewer frames, whose widths are the start values.
 
     Returns
     -------
@@ -316,7 +337,7 @@ def _part_of(plane, frame, pairs, before):
     ny, nx = frame.image_shape
     many = len(at) >= _FOR_NODES
     design = _low_order(2 * pairs.x / (nx - 1) - 1, 2 * pairs.y / (ny - 1) - 1, 2 if many else 1)
-    # keeps three pairs in a row from being a singular problem, and changes nothing else
+    # Without this, three pairs on a line would be a singular problem.
     ridge = 1e-4 * np.eye(design.shape[1])
     keep = np.ones(len(at), bool)
     for _ in range(4):
@@ -333,7 +354,7 @@ def _part_of(plane, frame, pairs, before):
         sigma = max(sigma, _SCATTER_OF_FEW)
         return _Part(frame, at[keep], sky[keep], np.full(keep.sum(), sigma**2))
     low = _low_order(*NODES.T, 2)
-    # nine nodes tell no more than the terms of the fit
+    # Nine nodes contain no more information than the terms of the fit.
     variance = len(NODES) / low.shape[1] * sigma**2 * np.einsum("ij,jk,ik->i", low, inner, low)
     return _Part(frame, there, known_there + low @ fit, variance)
 
@@ -407,10 +428,10 @@ def _learn(parts, solution, covariance, widths, columns, half):
         for d in range(2, _DEGREE + 1)
     )
     starts = [columns["detectors"][d] for d in {part.frame.detector for part in parts}]
-    # 0.455 is the median of chi-square with one degree of freedom
+    # The median of chi square with one degree of freedom is 0.455.
     place = np.median([second[k] for k in starts]) / 0.455
     turn = np.median([second[k + 1 : k + 3].mean() for k in starts]) / 0.455
-    # with few detectors the first guess has its say, as five of them
+    # The first guess counts as much as five detectors.
     n = len(starts)
     place = np.sqrt((n * place + 5 * _PLACE**2) / (n + 5))
     turn = np.sqrt((n * turn + 5 * (_TURN * half) ** 2) / (n + 5))
@@ -429,9 +450,9 @@ def _deviations(parts, widths, covariance):
         rest = (1 + 1e-9) * np.eye(len(rows)) - rows @ inner @ rows.T
         inverse = np.linalg.inv(rest)
         left_out = inverse @ residual
-        # variance of the frame without what doubt has added
+        # Variance of the frame without the part added by doubt.
         spread = inverse - (1 - 1 / part.doubt**2 - 1e-9) * np.eye(len(rows))
-        # as if all of it were a shift, the one way in which wrong matches are wrong
+        # As if all of it were a shift, because wrong matches are off by a shift.
         sigma = np.sqrt(max(float((left_out * np.linalg.solve(spread, left_out)).sum()), 0.0) / 2)
         shift = np.hypot(*np.median(left_out / weight, axis=0))
         deviations[part.frame.name] = sigma, float(shift)

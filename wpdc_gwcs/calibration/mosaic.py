@@ -1,4 +1,4 @@
-"""Detectors that are matched tell where the others of their exposure must be.
+"""Matched detectors as a starting point for the other detectors of their exposure.
 
 ::
 
@@ -8,7 +8,8 @@
 
 A detector with few stars, or with a header that is far off, cannot be matched alone.  Its neighbors
 in the same exposure determine pointing, rotation and scale, and other exposures of the camera
-determine its place in the focal plane.  The remaining search is so narrow that six pairs are proof.
+determine its place in the focal plane.  The remaining search is so narrow that a few pairs are
+proof.
 """
 
 import logging
@@ -38,54 +39,55 @@ __all__ = ["start_from_neighbors"]
 
 log = logging.getLogger(__name__)
 
-# Searches reach so many standard errors of the prediction, and these margins in px: distortion
-# within a detector that is not yet known.
+# A search reaches this many standard errors of the prediction, plus these margins in px for unknown
+# distortion within a detector.
 _N_SIGMA = 4.0
 _SHIFT_MARGIN, _BEND_MARGIN = 2.0, 1.0
-# Widest search, px, step by step: what is near a matched detector comes first, and tells of the
-# next; from the last on `match_planes` finds as much by itself.
+# Widest search of each step, px: detectors near a matched one come first, and improve the
+# prediction for the next ones.  Beyond the last step, `match_planes` finds as much by itself.
 _STEPS = (40.0, 120.0, 360.0)
-# Error of a place common to several exposures that is left to each of them, px.
+# Error that each of several exposures may have beyond their common error of the place, px.
 _ALIKE = 4.0
-# A frame is tried again when the search has become narrower by this factor.
+# A frame is tried again if the search has become narrower by this factor.
 _NARROWER = 0.8
-# From so many pairs on, the full match may go on from the narrow search.
+# Minimum number of pairs from which the full match may continue after a narrow search.
 _FOR_FULL_MATCH = 8
 _MOST_ROUNDS = 60
-# A match that the other frames contradict: so many standard errors, px, and others that agree.
+# Limits for a match that the other frames contradict: standard errors, px, and the number of other
+# frames that agree.
 _WRONG_SIGMA, _WRONG_SHIFT, _WITNESSES = 7.0, 5.0, 2
 _MOST_SUSPECTS = 5
-# A match so complete cannot be a chance: then the header is wrong, not the match.
+# A match with this completeness cannot be due to chance: the header is wrong, not the match.
 _BEYOND_DOUBT = 0.5
 
 
 @one_blas_thread
 def start_from_neighbors(frames, results, catalog, settings=None, *, solution=None):
-    """Match the frames that could not be matched alone, from those of their exposure that could.
+    """Match the frames that could not be matched alone, starting from matched frames.
 
     Parameters
     ----------
     frames : list of Frame
         All frames of a run.
     results : dict
-        Frame name to `MatchedFrame` or `FailedFrame`.
+        `MatchedFrame` or `FailedFrame` by frame name.
     catalog : `~astropy.table.Table`
         Reference catalog as returned by `read_catalog`.
     settings : Settings, optional
-        Choices of the run.
+        Settings of the run.
     solution : DistortionSolution or mapping, optional
-        Stored solution, whose reference points the new matches start from.
+        Stored solution, whose reference point is used for the new matches.
 
     Returns
     -------
     dict
-        As ``results``, in the same order, with more matched frames; a match that the other frames
-        of its exposure prove wrong has been replaced, or failed.
+        Like ``results``, in the same order, with more matched frames.  A match that the other
+        frames of its exposure prove wrong is replaced, or fails.
 
     Notes
     -----
     Only frames with a camera and an exposure are used.  A frame that is still not matched keeps
-    the reason that it had.
+    its original error.
 
     Examples
     --------
@@ -114,7 +116,7 @@ def start_from_neighbors(frames, results, catalog, settings=None, *, solution=No
                 results.update(_solve(plane, results, catalog, settings, solution))
                 if len(plane.exposures) == 1:
                     continue
-                # an exposure whose optics or places are not those of the others has only itself
+                # An exposure whose optics or places differ from the others is solved by itself.
                 for exposure in plane.exposures:
                     part = plane.of(exposure)
                     if any(isinstance(results[name], FailedFrame) for name in part.frames):
@@ -128,7 +130,7 @@ def _has_neighbors(frames):
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """A frame to be matched: what was measured on it, and what a search may use."""
+    """A frame to be matched, with its sources and the data for a search."""
 
     frame: object
     sources: object
@@ -150,7 +152,7 @@ def _solve(plane, results, catalog, settings, solution):
         if wrong is not None:
             doubted[wrong] = matched.pop(wrong)
             failed[wrong] = doubted[wrong]
-            # what was learned with it in the wrong place is to be learned anew
+            # Everything that was learned with this frame in the wrong place is learned again.
             geometry = None
             continue
         new = {}
@@ -191,7 +193,7 @@ def _match_all(new, catalog, settings):
             left.setdefault(task.frame.detector, []).append((task, prediction))
     have = {new[name][0].frame.detector for name in found}
     for detector, tried in left.items():
-        # one that has been found once is predicted better in the next round
+        # A frame that was found once is predicted better in the next round.
         if detector not in have and len(tried) > 1:
             try:
                 found |= _match_together(*zip(*tried, strict=True), catalog, settings)
@@ -201,7 +203,7 @@ def _match_all(new, catalog, settings):
 
 
 def _can_be_tried(result):
-    """Frames without sources or with a stored solution that is not theirs have other troubles."""
+    """Frames without sources, or with the wrong stored solution, failed for other reasons."""
     return result.sources is not None and isinstance(result.error, MatchError)
 
 
@@ -227,8 +229,8 @@ def _pairs_of(matched):
 def _contradicted(plane, geometry, matched, known):
     """Name of the matched frame that the others contradict, or `None`.
 
-    A wrong frame makes others look wrong, above all the same detector in another exposure: the one
-    is wrong without which the rest agrees best.
+    A wrong frame makes others look wrong, especially the same detector in another exposure.  So the
+    wrong one is that without which the rest agrees best.
     """
     exposures = [plane.frames[n].exposure for n in geometry.deviations]
     suspects = [
@@ -245,7 +247,7 @@ def _contradicted(plane, geometry, matched, known):
     disagreement = {}
     for _, name in sorted(suspects, reverse=True)[:_MOST_SUSPECTS]:
         rest = fit_geometry(plane, {n: p for n, p in pairs.items() if n != name})
-        # as sum of squares, in which no single frame counts for more than is sure to be wrong
+        # Sum of squares, limited so that a single frame that is certainly wrong does not dominate.
         left = [min(sigma, 3 * _WRONG_SIGMA) ** 2 for sigma, _ in rest.deviations.values()]
         disagreement[name] = sum(left)
     return min(disagreement, key=disagreement.get)
@@ -316,7 +318,7 @@ def _center(frame):
 
 
 def _search(prediction):
-    """How far a search about a prediction must go, px."""
+    """Largest shift and bend of a search about a prediction, px."""
     return {
         "max_shift": _N_SIGMA * prediction.shift + _SHIFT_MARGIN,
         "max_bend": _N_SIGMA * prediction.bend + _BEND_MARGIN,
@@ -324,10 +326,10 @@ def _search(prediction):
 
 
 def _match_together(tasks, predictions, catalog, settings):
-    """Match the frames of one detector in several exposures, whose place is wrong for all alike.
+    """Match the frames of one detector in several exposures, which share the error of its place.
 
-    Frames of too few stars, each for itself, are proof together: what is found for all of them is
-    the prediction for each.
+    Frames that have too few stars individually are proof together.  The common result is the
+    prediction for each of them.
     """
     stars = [_stars(t, p, catalog, settings) for t, p in zip(tasks, predictions, strict=True)]
 
@@ -391,7 +393,7 @@ def _match(task, prediction, catalog, settings, **search):
                 start=SmoothMap.identity(frame.image_shape),
             )
         except MatchError as err:
-            # what the narrow search has found is proof by itself
+            # The result of the narrow search is proof by itself.
             log.debug("%s: %s", frame.name, err)
     return MatchedFrame(
         name=frame.name,
