@@ -47,7 +47,30 @@ _ERROR_FLOOR = 0.01  # px
 
 @dataclass(frozen=True, eq=False)
 class MatchedFrame:
-    """One frame, measured and matched: what the joint solution of its detector needs.
+    """One frame, measured and matched, as input of the joint solution.
+
+    Parameters
+    ----------
+    name, source, detector, image_shape, wcs, exposure, camera, epoch
+        As in `~wpdc_gwcs.frame.Frame`.
+    sources : `~astropy.table.Table`
+        Measured sources.
+    usable : (N,) ndarray of bool
+        Mask of the sources that may be matched.
+    reference : `~astropy.table.Table`
+        Reference stars in reach of the frame, at its epoch, with their ``catalog_index``.
+    pairs : (i, j) of ndarray of int
+        Rows of the pairs in ``sources`` and in ``reference``.
+    start : LinearWCS
+        WCS from which the match started.
+    diagnostics : MatchDiagnostics
+        Evidence for the match.
+    from_image : bool
+        Whether the sources were measured on an image.
+    seconds : float
+        Time that measuring and matching took, s.
+    left_out : str, optional
+        Numbers of sources that each rule excludes, in words.
 
     Examples
     --------
@@ -88,7 +111,19 @@ class MatchedFrame:
 
 @dataclass(frozen=True, eq=False)
 class FailedFrame:
-    """A frame that could not be matched, why, and what was measured on it."""
+    """A frame that could not be matched.
+
+    Parameters
+    ----------
+    error : WPDCError
+        Reason of the failure.
+    n_sources : int
+        Number of measured sources.
+    seconds : float
+        Time until the failure, s.
+    sources : `~astropy.table.Table`, optional
+        Measured sources.
+    """
 
     error: WPDCError
     n_sources: int
@@ -106,11 +141,11 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     catalog : path-like, Table, SkyCoord, GaiaArchive or HatsCatalog
         Reference catalog: what `read_catalog` takes, or has returned.
     settings : Settings, optional
-        Choices; the defaults work for any camera.
+        Settings; the defaults work for any camera.
     sources : `~astropy.table.Table`, optional
-        What `measure_sources` found, where that has been done already.
+        Result of `measure_sources`, if the frame has already been measured.
     solution : DistortionSolution, optional
-        Stored solution of the detector, which takes the distortion off before the match.
+        Stored solution of the detector, which removes the distortion before the match.
 
     Returns
     -------
@@ -120,7 +155,7 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
     Raises
     ------
     DetectionError, MatchError
-        If there are no stars, or the evidence for a match is not there.
+        If there are no stars, or the evidence for a match is not sufficient.
 
     Examples
     --------
@@ -190,17 +225,17 @@ def match_frame(frame, catalog, settings=None, *, sources=None, solution=None):
 
 
 def with_errors(sources):
-    """Add errors by signal-to-noise where a list has none; their scale is fitted later.
+    """Add errors from the signal-to-noise ratio to a list without errors.
 
     Parameters
     ----------
     sources : `~astropy.table.Table`
-        What was measured.
+        Measured sources.
 
     Returns
     -------
     `~astropy.table.Table`
-        The same, or a copy with ``x_err`` and ``y_err``.
+        The same table, or a copy with ``x_err`` and ``y_err`` in px.  Their scale is fitted later.
     """
     if "snr" not in sources.colnames or {"x_err", "y_err"} <= set(sources.colnames):
         return sources
@@ -212,27 +247,27 @@ def with_errors(sources):
 
 
 def usable_sources(sources, frame, settings):
-    """Mark the sources that may enter the match.
+    """Mark the sources that may be matched.
 
     Parameters
     ----------
     sources : `~astropy.table.Table`
-        What was measured.
+        Measured sources.
     frame : Frame
-        Its shape counts.
+        The frame, for its shape.
     settings : Settings
         ``max_roundness`` and ``min_snr`` are used.
 
     Returns
     -------
     (N,) ndarray of bool
-        Mask over the sources, see `wpdc_gwcs.matching.select_sources`.
+        Mask of the sources, see `wpdc_gwcs.matching.select_sources`.
     """
     return ~np.any(list(rules_of(sources, frame, settings).values()), axis=0)
 
 
 def _start(frame, solution):
-    """Linear WCS about which a frame is matched."""
+    """Linear WCS from which the match of a frame starts."""
     point = header_reference_point(frame) if solution is None else solution.crpix
     start = linear_wcs(frame.wcs, point)
     if not has_inverse(start.cd):
@@ -254,81 +289,82 @@ def _reach(frame, start, settings):
 
 
 def sky_of_frame(frame, settings, *, solution=None):
-    """Return where on the sky the stars of a frame are, and those that others may need to find it.
+    """Return the part of the sky whose stars are needed for a frame and for its neighbors.
 
     Parameters
     ----------
     frame : Frame
-        Its WCS tells where.
+        The frame, for its WCS.
     settings : Settings
-        A blind search needs more.
+        Settings of the run; a blind search needs a larger part.
     solution : DistortionSolution, optional
         Stored solution of the detector.
 
     Returns
     -------
     tuple of float or None
-        Center and radius, deg; `None` of a frame whose WCS does not tell, which fails by itself.
+        RA and Dec of the center, and radius, deg; `None` if the WCS cannot be used, so the frame
+        will fail.
     """
     try:
         ra, dec, radius = _reach(frame, _start(frame, solution), settings)
-    except Exception:  # noqa: BLE001  Any WCS may be handed in, and what is wrong is told later.
+    except Exception:  # noqa: BLE001  Users may pass any WCS; the match reports what is wrong.
         return None
     if not (np.isfinite([ra, dec, radius]).all() and radius < 180):
         return None
-    # A frame whose header is worse is looked for around its neighbors, and a star of no known
-    # motion moves with the thirty that are nearest to it, wherever it is.
+    # A frame with a worse header is searched around its neighbors.  A star without a known motion
+    # moves with its thirty nearest neighbors, so these are needed, too.
     return ra, dec, 1.25 * radius + 0.1
 
 
 def catalog_of_frame(frame, catalog, settings, *, solution=None):
-    """Cut the reference catalog to what a frame can need, to be handed to another process.
+    """Cut the reference catalog to the part that a frame may need, for another process.
 
     Parameters
     ----------
     frame : Frame
-        Its WCS tells where.
+        The frame, for its WCS.
     catalog : `~astropy.table.Table`
-        Reference catalog whose motions have been filled.
+        Reference catalog after `fill_motions`.
     settings : Settings
-        A blind search needs more.
+        Settings of the run; a blind search needs a larger part.
     solution : DistortionSolution, optional
         Stored solution of the detector.
 
     Returns
     -------
     `~astropy.table.Table`
-        Rows of the catalog, from which `match_frame` selects the same stars as from all.
+        Rows from which `match_frame` selects the same stars as from the whole catalog.
     """
     return select_cone(catalog, *_reach(frame, _start(frame, solution), settings))
 
 
 def reference_in_reach(frame, catalog, start, settings):
-    """Select the reference stars that the frame can show, at its epoch.
+    """Select the reference stars that may be on the frame, at its epoch.
 
     Parameters
     ----------
     frame : Frame
-        Its WCS tells where.
+        The frame, for its WCS and epoch.
     catalog : `~astropy.table.Table`
         Reference catalog.
     start : LinearWCS
-        Its scale counts.
+        WCS from which the match starts, for its scale.
     settings : Settings
-        A blind search needs more.
+        Settings of the run; a blind search needs a larger part of the sky.
 
     Returns
     -------
     `~astropy.table.Table`
-        Rows of the catalog.
+        Rows of the catalog at the epoch of the frame.
 
     Raises
     ------
     MatchError
-        If there are none.
+        If there are no such stars.
     """
     ra, dec, radius = _reach(frame, start, settings)
-    # Before the cut, which would take neighbors away; in a run it has been done for all frames.
+    # Before the cut, which would remove neighbors; in a run, this has been done for all frames.
     near = select_cone(fill_motions(catalog), ra, dec, radius)
     if settings.max_mag is not None and "phot_g_mean_mag" in near.colnames:
         near = near[~(np.asarray(near["phot_g_mean_mag"], float) > settings.max_mag)]

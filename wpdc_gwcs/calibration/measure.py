@@ -23,33 +23,33 @@ __all__ = ["measure_sources", "quality_of", "rules_of"]
 
 log = logging.getLogger(__name__)
 
-# Images smaller than this, px, have no background, and no stars on it.
+# Smaller images (px) have no measurable background.
 _SMALLEST = 8
 
-# Rounds after which close pairs have shared out their light.
+# Number of rounds after which the light of close pairs is divided correctly.
 _PASSES_OF_PAIRS = 5
 
-# Noise of the sky in electrons below which a gain cannot be that of the pixels: no detector reads
-# out so quietly, and the sky's own photons come on top.  Where the header has the read noise, it is
-# this share of that, since headers round and nominal values differ.
+# Noise of the sky in electrons below which a gain cannot be correct: no detector has so little read
+# noise, and the photons of the sky add to it.  If the header has the read noise, the limit is this
+# fraction of it, because headers have rounded or nominal values.
 _MIN_ELECTRONS, _SHARE_OF_READ_NOISE = 0.2, 0.5
 
-# Factors between a stated gain and the one that the noise in the stars shows.  Less scatter than
-# the photons' is proof; more of it may also be a PSF that does not fit, even if it fits well: in
-# frames of CFHT/WIRCam it is that of half the gain that the noise of their skies bears out.
+# Limits of the ratio between a stated gain and the gain from the noise in stars.  Less scatter than
+# that of photons is proof of a wrong gain.  More scatter may also come from an imperfect PSF: in
+# frames of CFHT/WIRCam it corresponds to half of the gain that the noise of the sky confirms.
 _MAX_GAIN_RATIO, _MAX_GAIN_EXCESS = 2.5, 4.0
 _GOOD_MISMATCH = 0.03
-# Stars that prove it.
+# Minimum number of stars for this test.
 _MIN_STARS = 20
 
-# Signal-to-noise ratio in an aperture that holds all the light of a star, over that of the fit:
-# 2 sigma / (1.5 FWHM) for a Gaussian and a radius of 1.5 FWHM, a little more with its photons.  The
-# limit is about the ratio in an aperture; the fit's is the less noisy measure of it, for any PSF.
+# Ratio of the signal-to-noise ratio in an aperture with all the light of a star to that of the fit:
+# 2 sigma / (1.5 FWHM) for a Gaussian and a radius of 1.5 FWHM, slightly more with photon noise.
+# The limit ``min_snr`` refers to an aperture, but the value from the fit is less noisy.
 _APERTURE_SHARE = 0.61
 
 
 def measure_sources(frame, settings=None):
-    """Source table of a frame: measured on its image, or read from its source list.
+    """Measure the sources of a frame on its image, or read them from its source list.
 
     Parameters
     ----------
@@ -61,25 +61,29 @@ def measure_sources(frame, settings=None):
     Returns
     -------
     `~astropy.table.Table`
-        Columns ``x``, ``y`` (px, zero based) and what else was measured.  Of an image, the meta
-        data have ``fwhm`` (px), ``ellipticity``, ``saturation``, ``noise`` (counts), ``pixels``
-        (zero based) and, if a PSF was fitted, ``gain`` (electrons per count), ``gain_from``
-        (``given``, ``header`` or ``noise``) and ``mismatch`` (of the PSF, relative).
+        Columns ``x``, ``y`` (px, zero based) and other measured columns.  For an image, the
+        metadata has ``fwhm`` (px), ``ellipticity``, ``saturation`` and ``noise`` (counts),
+        ``pixels`` ("zero based"), ``n_faint`` (number of sources below ``min_snr``) and, if a PSF
+        was fitted, ``gain`` (electrons per count), ``gain_from`` (``given``, ``header`` or
+        ``noise``) and ``mismatch`` (relative error of the PSF at its peak).
 
     Raises
     ------
     DetectionError
-        If there are no stars on the image, or no rows in the list.
+        If the image is too small or has no source above ``min_snr``, if the list has no rows, or
+        if ``centroids="given"`` is set for an image.
 
     Warns
     -----
     WPDCWarning
-        If the header's gain or saturation contradicts the pixels: it is left aside.
+        If the header's gain or saturation level contradicts the pixels and is not used.
+    CentroidWarning
+        If there are too few stars for a PSF, so that the centroids are windowed.
 
     Notes
     -----
-    Fainter stars than ``min_snr`` are measured with the others, whose light they disturb, and left
-    out at the end.
+    Sources fainter than ``min_snr`` are measured with the others, whose light they disturb, and
+    left out at the end.
 
     Examples
     --------
@@ -109,7 +113,7 @@ def measure_sources(frame, settings=None):
     announce("background")
     mask = None if frame.load_mask is None else frame.load_mask()
     weight = None if frame.load_weight is None else frame.load_weight()
-    # Without a name here, so that the image is gone once its background is off.
+    # The image has no name here, so its memory is free once the background is subtracted.
     background = subtract_background(
         frame.load_image(), mask=mask, weight=weight, overwrite=frame.fresh_image
     )
@@ -145,7 +149,7 @@ def measure_sources(frame, settings=None):
                 mismatch=noise.mismatch,
             )
     sources.meta["noise"] = background.noise
-    # Said in the file, which may be read as a list.
+    # The table may be written to a file and read as a source list later.
     sources.meta["pixels"] = "zero based"
     if settings.min_snr == 0:
         return sources
@@ -161,7 +165,7 @@ def measure_sources(frame, settings=None):
 
 
 def quality_of(frame, sources, settings, *, counts=None):
-    """Tell what a frame is like: its PSF and noise, and how many sources each rule leaves out.
+    """Summarize the quality of a frame: its PSF and noise, and how many sources each rule excludes.
 
     Parameters
     ----------
@@ -172,14 +176,14 @@ def quality_of(frame, sources, settings, *, counts=None):
     settings : Settings
         ``max_roundness`` and ``min_snr`` are used.
     counts : str, optional
-        What `wpdc_gwcs.selection.left_out` has told of the sources, where it was asked before.
+        Result of `wpdc_gwcs.selection.left_out` for the sources, if it is already known.
 
     Returns
     -------
     dict
-        ``fwhm`` (px), ``ellipticity``, ``mismatch`` (error of the PSF at its peak, relative),
-        ``gain`` (electrons per count, as measured), ``noise`` (counts), each NaN where it has not
-        been measured, and ``left_out``.
+        ``fwhm`` (px), ``ellipticity``, ``mismatch`` (relative error of the PSF at its peak),
+        ``gain`` (electrons per count, as measured) and ``noise`` (counts), each NaN if it was not
+        measured, and ``left_out``.
     """
     meta = {} if sources is None else sources.meta
     result = {}
@@ -192,14 +196,14 @@ def quality_of(frame, sources, settings, *, counts=None):
 
 
 def rules_of(sources, frame, settings):
-    """Judge the sources of a frame by the rules of the settings.
+    """Return the sources of a frame that each rule of the settings excludes.
 
     Parameters
     ----------
     sources : `~astropy.table.Table`
-        What was measured.
+        Measured sources.
     frame : Frame
-        Its shape counts.
+        The frame, for its shape.
     settings : Settings
         ``max_roundness`` and ``min_snr`` are used.
 
@@ -241,11 +245,12 @@ def _contradicts(gain, noise):
 
 
 def _measure_gain(background, detected, noise):
-    """Gain by the noise in one half of the stars about the PSF of the other half."""
+    """Gain from the noise in one half of the stars about the PSF of the other half."""
     snr = np.asarray(detected["snr"])
     half = np.empty(len(snr), bool)
     half[np.argsort(snr)] = np.arange(len(snr)) % 2 == 0
-    # All stay in the lists, as neighbors; without a signal none makes a PSF, or tells noise.
+    # All sources stay in the lists as neighbors, but those without a signal are not used for the
+    # PSF or the noise.
     one, other = detected.copy(), detected.copy()
     one["snr"][~half] = 0.0
     other["snr"][half] = 0.0
@@ -275,7 +280,7 @@ def _warn(frame, what, value, why):
 
 
 def _fit_psf(background, detected, epsf, gain, threshold):
-    """Fit the PSF to all sources and to what shows once they are subtracted from the image.
+    """Fit the PSF to all sources, and to those found after subtracting them from the image.
 
     Returns the sources as they were detected, companions included, and as they were fitted.
     """
