@@ -1,12 +1,12 @@
-"""What a run has done since its manifest and its summary were written.
+"""Journal of a run: its progress since manifest and summary were last written.
 
 ::
 
     set of files with ENTRY --put in place--> .RUN.journal (a line more) --fold--> manifest, summary
 
-Both grow with the run.  Writing them with every set would take a time that grows with its square;
-they are written when they have grown by a share of themselves, and at the end; until then a line
-for each set tells the rest.
+Both files grow with the run, so writing them with every set would take a time that grows with the
+square of its length.  They are written when they have grown by a certain fraction, and at the end.
+In between, the journal has a line for each set.
 """
 
 import json
@@ -23,7 +23,7 @@ _JOURNAL = re.compile(r"\.([0-9a-f]{12})\.journal")
 
 
 def journal_of(folder, run):
-    """Name the journal of a run.
+    """Return the path of the journal of a run.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def journal_of(folder, run):
     Returns
     -------
     Path
-        It may not be there.
+        Path of the journal, which may not exist.
     """
     return folder / f".{run}.journal"
 
@@ -51,7 +51,7 @@ def find_journals(folder):
     Returns
     -------
     dict
-        Identity of the run to path; mostly none.
+        Paths of the journals by the identity of their runs; usually empty.
     """
     with os.scandir(folder) as entries:
         names = [found for entry in entries if (found := _JOURNAL.fullmatch(entry.name))]
@@ -59,16 +59,16 @@ def find_journals(folder):
 
 
 def write_entry(folder, states, rows):
-    """Write what a set of files is into its folder.
+    """Write the entry of a set of files into its folder.
 
     Parameters
     ----------
     folder : Path
-        Where the set is made.
+        Folder of the set.
     states : dict
-        Frame name to what the manifest says of it.
+        Manifest entries by frame name.
     rows : dict
-        Frame name to its row of the summary.
+        Summary rows by frame name.
     """
     text = json.dumps({"states": states, "rows": rows}, default=_plain)
     (folder / ENTRY).write_text(text, encoding="utf-8")
@@ -81,15 +81,15 @@ def _plain(value):
 
 
 def add_to_journal(entry, journal):
-    """Add the entry of a set; twice is as good as once.
+    """Add the entry of a set to the journal; adding it twice does no harm.
 
     Parameters
     ----------
     entry, journal : Path
-        Files.
+        Files of the entry and of the journal.
     """
     with journal.open("a", encoding="utf-8") as file:
-        # What a program that was killed had begun to write ends here.
+        # This ends a line that a killed program may have left incomplete.
         file.write("\n" + entry.read_text(encoding="utf-8") + "\n")
         file.flush()
         os.fsync(file.fileno())
@@ -106,14 +106,14 @@ def read_journal(path):
     Returns
     -------
     states, rows : dict
-        As in `write_entry`, of all sets.
+        Entries of all sets, as for `write_entry`.
     """
     states, rows = {}, {}
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
             entry = json.loads(line)
         except ValueError:
-            # Cut off; its set is still there, and has been added again.
+            # An incomplete line: its set was still there and has been added again.
             continue
         states |= entry["states"]
         rows |= entry["rows"]

@@ -31,11 +31,12 @@ class Manifest:
     Parameters
     ----------
     run : str
-        Identity of the run, which all its files carry.
+        Identity of the run, which is in all its files.
     created : str
         Start time, UTC.
     software, settings, catalog, solution, update : dict, str, bool
-        Versions, options, and checksums of the reference catalog and the stored solutions.
+        Versions, options, checksums of the reference catalog and of the stored solutions, and
+        whether these are updated.
     inputs : list of dict
         Path, size and time of each input file.
     frames : dict
@@ -56,7 +57,7 @@ class Manifest:
     frames: dict = field(repr=False)
 
     def differences(self, other):
-        """Name the choices of another run that are not those of this one.
+        """List the choices of another run that differ from those of this one.
 
         Parameters
         ----------
@@ -66,7 +67,7 @@ class Manifest:
         Returns
         -------
         list of str
-            Such as ``n_grid 50, now 20``.
+            Differences such as ``n_grid 50, now 20``.
         """
         found = []
         for name in _CHOICES:
@@ -84,19 +85,20 @@ class Manifest:
         return found
 
     def is_same(self, other, names):
-        """Return whether some frames are solved together in two runs, and are the same frames.
+        """Return whether two runs solve the same frames together.
 
         Parameters
         ----------
         other : Manifest
             The other run.
         names : set of str
-            Frames that it solves together.
+            Names of frames that the other run solves together.
 
         Returns
         -------
         bool
-            False also if it cannot be told, of frames that are no files.
+            True if these are the same frames with the same inputs.  False also for frames that are
+            not from files, because they cannot be compared.
         """
         if not all(name in self.frames for name in names):
             return False
@@ -109,12 +111,12 @@ class Manifest:
         )
 
     def groups(self):
-        """Return which frames are solved together.
+        """Return the groups of frames that are solved together.
 
         Returns
         -------
         list of set of str
-            Their names.
+            Names of the frames of each group.
         """
         found = {}
         for name, frame in self.frames.items():
@@ -122,19 +124,19 @@ class Manifest:
         return list(found.values())
 
     def after(self, earlier, names):
-        """Manifest that goes on with that of an earlier run.
+        """Return the manifest of a run that continues an earlier one.
 
         Parameters
         ----------
         earlier : Manifest
-            The other run, whose identity it has.
+            The earlier run, whose identity is kept.
         names : set of str
-            Frames of it that this one does not have, and that stay: they come first.
+            Frames that only the earlier run has; they are kept, and come first.
 
         Returns
         -------
         Manifest
-            With the frames and the inputs of both.
+            Manifest with the frames and inputs of both runs.
         """
         kept = {n: frame for n, frame in earlier.frames.items() if n in names}
         first = 1 + max((frame["group"] for frame in kept.values()), default=-1)
@@ -150,51 +152,51 @@ class Manifest:
         )
 
     def with_states(self, states):
-        """Manifest after some frames are done.
+        """Return the manifest with new states of some frames.
 
         Parameters
         ----------
         states : dict
-            Frame name to what has changed of it.
+            Changed entries of frames, by name.
 
         Returns
         -------
         Manifest
-            The new one.
+            The new manifest.
         """
         frames = {n: {**frame, **states.get(n, {})} for n, frame in self.frames.items()}
         return dataclasses.replace(self, frames=frames)
 
     def to_json(self):
-        """Text of the manifest.
+        """Return the manifest as JSON.
 
         Returns
         -------
         str
-            JSON, two blanks of indentation.
+            JSON, indented by two spaces.
         """
         return json.dumps(dataclasses.asdict(self), indent=2) + "\n"
 
     def failure_of(self, name, reason):
-        """Error of a frame that failed.
+        """Return the error of a failed frame.
 
         Parameters
         ----------
         name : str
             Name of the frame.
         reason : str
-            Message.
+            Message of the error.
 
         Returns
         -------
         WPDCError
-            Of the class that it had.
+            Error of the class in the manifest.
         """
         kind = getattr(exceptions, str(self.frames[name].get("error")), FrameFailure)
         return kind(reason)
 
     def is_done(self, name):
-        """Return whether another try of a frame would give the same.
+        """Return whether a frame is done, so that another try would give the same result.
 
         Parameters
         ----------
@@ -204,36 +206,36 @@ class Manifest:
         Returns
         -------
         bool
-            False for what was not come to, or met an internal error.
+            False for a frame that is pending, or failed with an internal error.
         """
         frame = self.frames[name]
         return frame["state"] != "pending" and frame.get("error") != InternalError.__name__
 
 
 def plan_run(run_id, groups, *, settings, catalog, catalog_path, solution, update):
-    """Manifest of a run that begins.
+    """Make the manifest of a new run.
 
     Parameters
     ----------
     run_id : str
-        Its identity.
+        Identity of the run.
     groups : list of list of Frame
         Frames that are solved together.
     settings : Settings
-        Choices.
+        Settings of the run.
     catalog : `~astropy.table.Table`, GaiaArchive or HatsCatalog
-        Reference catalog as read, or the whole of which parts are read.
+        Reference catalog, or the archive from which its parts are read.
     catalog_path : path-like or None
-        Its file, if it came from one.
+        File of the catalog, if there is one.
     solution : DistortionSolution, mapping or None
         Stored solutions.
     update : bool
-        Whether they are updated.
+        Whether the stored solutions are updated.
 
     Returns
     -------
     Manifest
-        All frames pending.
+        Manifest in which all frames are pending.
     """
     files = {file: None for group in groups for frame in group for file in files_of(frame)}
     if catalog_path is not None:
@@ -245,7 +247,7 @@ def plan_run(run_id, groups, *, settings, catalog, catalog_path, solution, updat
             **{name: version(name) for name in _PACKAGES},
             "python": ".".join(map(str, sys.version_info[:3])),
         },
-        # As it is read back.
+        # In the form in which it is read back.
         settings=json.loads(json.dumps(dataclasses.asdict(settings), default=repr)),
         catalog=_sum_of_catalog(catalog),
         solution=None if solution is None else _sum_of_solution(solution),
@@ -272,17 +274,17 @@ def read_manifest(path):
     Parameters
     ----------
     path : path-like
-        File that holds `Manifest.to_json`.
+        File with the output of `Manifest.to_json`.
 
     Returns
     -------
     Manifest
-        As written.
+        The manifest.
 
     Raises
     ------
     FileFormatError
-        If the file is no manifest.
+        If the file is not a manifest.
     """
     try:
         manifest = Manifest(**json.loads(Path(path).read_text(encoding="utf-8")))
@@ -295,7 +297,7 @@ def read_manifest(path):
 
 
 def frame_sum(frame):
-    """Sum over what a frame is: size and time of its files, and what its header says.
+    """Compute a checksum of the input of a frame: size and time of its files, and its header.
 
     Parameters
     ----------
@@ -305,7 +307,7 @@ def frame_sum(frame):
     Returns
     -------
     str or None
-        `None` for a frame of no file, of which nothing can be said without reading it.
+        `None` for a frame that is not from a file.
     """
     files = files_of(frame)
     if not files or not all(file.is_file() for file in files):
@@ -321,13 +323,13 @@ def frame_sum(frame):
     text = json.dumps([plain, states], sort_keys=True, default=repr)
     try:
         sky = np.array(sky_of(frame.wcs, x.ravel(), y.ravel()))
-    except Exception:  # noqa: BLE001  A WCS that cannot be used is the failure of its frame, later.
+    except Exception:  # noqa: BLE001  A WCS that cannot be used makes its frame fail later.
         return None
     return hashlib.sha256(text.encode("utf-8", "surrogatepass") + sky.tobytes()).hexdigest()
 
 
 def files_of(frame):
-    """Files of a frame: that of its source, which may name an extension, and what goes with it.
+    """Return the files of a frame: that of its source, and those of mask and weight.
 
     Parameters
     ----------
@@ -337,7 +339,7 @@ def files_of(frame):
     Returns
     -------
     list of Path
-        Empty for a frame that came from no file.
+        Paths; empty for a frame that is not from a file.
     """
     if not frame.source:
         return []
@@ -356,7 +358,7 @@ def _state_of(file):
 
 
 def _sum_of_catalog(catalog):
-    """Identify a catalog; a part, which is another one for other frames, by what it is of."""
+    """Identify a catalog; a part, which depends on the frames, by the whole it comes from."""
     identity = getattr(catalog, "identity", None) or identity_of(catalog)
     if identity is not None:
         return {"part_of": identity}
