@@ -1,4 +1,4 @@
-"""Which frames of a run are solved together: cameras, or parts of those that are known already.
+"""Groups of frames that are solved together: cameras, or batches of a known camera.
 
 ::
 
@@ -9,55 +9,55 @@ from wpdc_gwcs.calibration.camera import cameras_of, exposure_key
 
 __all__ = ["are_independent", "batches_of"]
 
-# Exposures of a camera whose distortion is known that are solved together: enough to tell how much
-# scale and rotation vary between them, few enough that the memory of a run is that of a night.
+# Maximum number of exposures in a batch of a known camera: enough to learn how much scale and
+# rotation vary between them, and few enough to keep the memory of a long run small.
 _MOST_EXPOSURES = 16
 
 
 def are_independent(settings, *, solution, update):
-    """Return whether exposures of a known camera have nothing to tell each other.
+    """Return whether exposures of a known camera can be solved in separate batches.
 
     Parameters
     ----------
     settings : Settings
-        Choices.
+        Settings of the run.
     solution : DistortionSolution, mapping or None
         Stored solutions.
     update : bool
-        Whether they are updated.
+        Whether the stored solutions are updated.
 
     Returns
     -------
     bool
-        False without a stored solution, and where all exposures are tied together.
+        False without a stored solution, and if the settings tie all exposures together.
     """
     tied = update or settings.free_stars or settings.method == "paper"
     return solution is not None and not tied
 
 
 def batches_of(frames, settings, *, solution=None, update=False, earlier=()):
-    """Group frames that are solved together.
+    """Group the frames that are solved together.
 
     Parameters
     ----------
     frames : list of Frame
         All frames of a run.
     settings : Settings
-        Choices; free stars and the paper's method tie all exposures together.
+        Settings of the run; free stars and the paper's method tie all exposures together.
     solution : DistortionSolution, mapping or None, optional
         Stored solutions by detector, or one for all.
     update : bool, optional
-        Whether they are updated, from all frames at once.
+        Whether the stored solutions are updated, which takes all frames at once.
     earlier : iterable of set of str, optional
-        Names of frames that an earlier run of the same choices has solved together.
+        Names of the frames in each batch of an earlier run with the same settings.
 
     Returns
     -------
     list of list of Frame
-        Cameras: connected through detectors and exposures.  Where all detectors of one have stored
-        solutions, which stay as they are, its exposures have nothing in common but how much they
-        vary, and come in batches of 16 at most, in the order of the frames; those of an earlier run
-        first, as they were.
+        One list for each camera: frames that are connected by detectors and exposures.  If all
+        detectors of a camera have stored solutions that are not updated, it is divided into
+        batches of at most 16 exposures, in the order of the frames.  The batches of an earlier
+        run come first, unchanged.
     """
     cameras = cameras_of(frames)
     if not are_independent(settings, solution=solution, update=update):

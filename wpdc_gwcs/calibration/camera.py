@@ -1,4 +1,4 @@
-"""All frames of one camera, solved together: its detectors, and what is each exposure's own."""
+"""The joint solution of all frames of a camera: its detectors and its exposures."""
 
 import logging
 import time
@@ -40,7 +40,7 @@ _MAX_REMATCH = 3
 _SETTLED = 0.01
 _REMATCH_SIGMAS = 5.0
 
-# Columns of matches, which are plain arrays with units: residuals are computed with.
+# Units of the columns of matches.
 _UNITS = {
     **dict.fromkeys(("x", "y", "x_err", "y_err", "dx", "dy"), "pix"),
     **dict.fromkeys(("ra", "dec"), "deg"),
@@ -49,7 +49,7 @@ _UNITS = {
 
 
 def cameras_of(frames):
-    """Group frames that are solved together: detectors that share an exposure are one camera.
+    """Group frames by camera: detectors that share an exposure belong to one camera.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def cameras_of(frames):
     Returns
     -------
     list of list of MatchedFrame
-        Connected through detectors and exposures.
+        One list for each camera: frames that are connected by detectors and exposures.
     """
     parent = {}
 
@@ -79,7 +79,7 @@ def cameras_of(frames):
 
 
 def exposure_key(frame):
-    """Tell what a frame has in common with the others of its exposure.
+    """Return the key that a frame shares with the other frames of its exposure.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def exposure_key(frame):
     Returns
     -------
     hashable
-        Its name, if it is on its own.
+        Camera and exposure; the name of the frame if it belongs to no exposure.
     """
     if frame.camera is None or frame.exposure is None:
         return frame.name
@@ -108,22 +108,22 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
     group : list of MatchedFrame
         Matched frames of detectors that share exposures, or of one detector.
     settings : Settings
-        Choices.
+        Settings of the run.
     holdout : (n_catalog,) array_like of bool, optional
-        Reference stars, by their row in the catalog, that are kept out of every fit.
+        Mask over the rows of the catalog: stars that are kept out of every fit.
     solution : dict, optional
         Stored solutions by detector.
     update : bool, optional
-        Merge the frames into the stored solutions.
+        Whether to merge the frames into the stored solutions.
 
     Returns
     -------
     solutions : dict
-        Detector name to its `DistortionSolution`.
+        `DistortionSolution` of each detector, by name.
     calibrations : list of Calibration
         One for each solved frame.
     failures : dict
-        Frame name to error.
+        Error of each frame that could not be solved, by name.
 
     Examples
     --------
@@ -181,7 +181,7 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
         except FitError as err:
             return {}, [], failures | _own_reasons(group, err)
         if len(result.table_infos) == len(shapes):
-            # A few other pairs would choose no differently.
+            # A few changed pairs do not change the choice.
             choice = {name: info.choice for name, info in result.table_infos.items()}
         if attempt + 1 == _MAX_REMATCH:
             break
@@ -224,7 +224,7 @@ def _delivered(group, pairs, result, settings, holdout, solution, failures, bega
         if update and name in solution:
             one = _dated(one, own, solution[name])
         if update or name not in solution:
-            # A stored one that stays as it is stays that of its own frames.
+            # A stored solution that is not updated keeps the provenance of its own frames.
             one = replace(one, provenance=_provenance(own, one.provenance if update else {}))
         solutions[name] = one
     result = replace(result, solutions=solutions)
@@ -252,7 +252,7 @@ def _delivered(group, pairs, result, settings, holdout, solution, failures, bega
 
 
 def _weights(settings, shapes):
-    """Radial weight of each detector; none where no table mends what the default leaves out."""
+    """Radial weight of each detector; `None` if no table corrects what the default leaves out."""
     if settings.lut == "none" and settings.weight == Settings.weight:
         return None
     return {name: settings.radial_weight(shape) for name, shape in shapes.items()}
@@ -307,8 +307,8 @@ def _of_one_shape(group, failures):
     return [frame for frame in group if frame.name not in failures]
 
 
-# Pairs that a frame brings at least where its detector is known from elsewhere: they only prove
-# that it is the right place.
+# Minimum number of pairs of a frame whose detector is already known: they only have to prove that
+# the position is right.
 _MIN_PAIRS_KNOWN = 4
 
 
@@ -432,7 +432,8 @@ def _position_errors(src, ref, cd):
     errors = [numbers_or_none(ref, name) for name in ("ra_error", "dec_error")]
     if any(e is None for e in errors):
         return x_err, y_err, None
-    # Small beside those of the centroids: the mean of both axes serves at any roll.
+    # They are small compared with those of the centroids, so the mean of both axes is good enough
+    # at any roll.
     reference = np.sqrt(np.mean(np.nan_to_num(errors) ** 2, axis=0)) / scale
     return np.hypot(x_err, reference), np.hypot(y_err, reference), reference
 
@@ -444,7 +445,7 @@ def _rematch(frame, pairs, calibration, fit):
     xs, ys = calibration.undistort(np.asarray(src["x"], float), np.asarray(src["y"], float))
     attitude = LinearWCS(crpix=calibration.solution.crpix, cd=fit.cd, crval=fit.crval)
     xr, yr = attitude.pixels(frame.reference["ra"], frame.reference["dec"])
-    # The errors of the pairs say how far apart a star and its source can be.
+    # The errors of the pairs limit the distance between a star and its source.
     sigma = np.sqrt(0.5 * (fit.x_err**2 + fit.y_err**2))
     typical = np.nanmedian(sigma[fit.used])
     x_err, y_err = numbers_or_none(src, "x_err"), numbers_or_none(src, "y_err")
@@ -457,7 +458,7 @@ def _rematch(frame, pairs, calibration, fit):
         each = np.clip(each * typical / own, 0.5 * typical, 10 * typical)
     i_src, i_ref, _ = pair_nearest(xs, ys, xr, yr, _REMATCH_SIGMAS * each)
     i_src = pick[i_src]
-    # Pairs that the fit used are right; of stars whose place is badly known they are wider apart.
+    # Pairs in the fit are correct; stars with poor positions may be farther from their sources.
     old = fit.used & ~np.isin(pairs[0], i_src) & ~np.isin(pairs[1], i_ref)
     return np.append(i_src, pairs[0][old]), np.append(i_ref, pairs[1][old])
 
@@ -497,7 +498,7 @@ def _calibration(frame, pairs, fit, result, settings, holdout, seconds, *, store
         matches["ra_offset"], matches["dec_offset"] = fit.reference_offset
     for name in matches.colnames:
         matches[name].unit = _UNITS.get(name)
-    # Not of use here, but to see whether residuals depend on them.
+    # Not used here, but they show whether residuals depend on them.
     for table, name in ((src, "snr"), (ref, "phot_g_mean_mag"), (ref, "bp_rp")):
         if name in table.colnames:
             matches[name] = numbers_or_none(table, name)

@@ -1,7 +1,7 @@
-"""Whether a solution agrees with its own stars, and what it lacks.
+"""Checks of a solution against its own stars.
 
-A solution that contradicts its stars is never delivered; one that lacks something is delivered as
-degraded, with the reasons.
+A solution that contradicts its stars is never delivered.  A solution with shortcomings is delivered
+as degraded, with the reasons.
 """
 
 import numpy as np
@@ -14,68 +14,68 @@ from wpdc_gwcs.exceptions import FitError
 
 __all__ = ["check_solution", "shortcomings"]
 
-# Stars that agree with a solution: six numbers from fewer are at the mercy of one wrong pair, but
-# for a detector whose place other frames know.
+# Minimum number of stars that agree with a solution: with fewer, one wrong pair could spoil the six
+# linear numbers.  If other frames determine the position of the detector, fewer stars are enough.
 _MIN_STARS, _MIN_STARS_KNOWN = 10, 4
 
-# Residuals of right pairs, px, but for centroids as bad as that.
+# Maximum scatter of the residuals, in px or in units of their errors, whichever is larger.
 _MAX_SIGMA = 1.0
 _MAX_OVER_ERRORS = 3.0
 
-# Frames of one detector years apart differ by a tenth of a pixel in places: that is in their
-# statistics, and no reason to doubt them.
+# Frames of one detector that are years apart may differ by a tenth of a pixel in some parts.  Their
+# statistics show this, and it is no reason to doubt them.
 _MAX_OFFSET = 0.25  # px
 
-# Bad seeing makes centroids worse than those a stored solution was made of, but not this much.
+# Bad seeing makes centroids worse than those of the stored solution, but not by this factor.
 _STORED_RATIO = 5.0
 
-# The stars' outline covers so much of the detector; random stars do from about 35 on.
+# Minimum fraction of the detector within the outline of the stars; about 35 random stars reach it.
 _MIN_COVERAGE = 0.7
 
-# Share of the detector that a circle without stars may cover: random stars hardly ever leave one so
-# large from 20 on, stars along the rim always do.
+# Largest fraction of the detector that a circle without stars may cover: 20 or more random stars
+# hardly ever leave such a hole, but stars along the edge always do.
 _MAX_HOLE = 0.35
 
 # Points along each axis at which circles are centered.
 _HOLE_NODES = 41
 
-# Uncertainty of the map, px, and the share of the detector that may exceed it.
+# Uncertainty of the map, px, and the fraction of the detector that may exceed it.
 _MAX_MAP_SIGMA, _UNCERTAIN_SHARE = 0.25, 0.05
 
-# Share of the matched stars that the fit uses, and of the stars of the shorter list that match.
+# Minimum fraction of the matched stars that the fit uses, and of the shorter list that matches.
 _MIN_USED, _MIN_COMPLETENESS = 0.7, 0.3
 
-# The same with all detections counted, also those that are flagged, not round or faint: where most
-# are, it is the measurement that is wrong, and right pairs are few by luck.
+# The same for all detections, including those that are flagged, not round or faint.  If most are,
+# the measurement itself is wrong, and the few correct pairs are luck.
 _MIN_DETECTED = 0.25
 
-# Change of area by which a map may differ from its mean; beyond, it comes close to folding.
+# Limits of the area of a pixel relative to the median; beyond them, the map is close to folding.
 _MIN_AREA, _MAX_AREA = 0.5, 2.0
 
 
 def check_solution(frame, calibration, *, stored=None, known=False):
-    """Raise an error where the solution of a frame contradicts its stars.
+    """Raise an error if the solution of a frame contradicts its stars.
 
     Parameters
     ----------
     frame : MatchedFrame
-        The frame, for its shape and for messages.
+        The frame, for messages.
     calibration : Calibration
-        With matches and statistics.
+        Calibration of the frame, with matches and statistics.
     stored : DistortionSolution, optional
-        The stored solution, where the frame had to take its distortion as it is.
+        The stored solution, if the frame uses its distortion unchanged.
     known : bool, optional
-        Whether other detectors or a stored solution know the place of this one.
+        Whether other detectors or a stored solution determine the position of this detector.
 
     Raises
     ------
     FitError
-        If too few stars agree, they scatter far beyond their errors, or not as those of the stored
-        solution.
+        If too few stars agree with the solution, or their residuals scatter far more than their
+        errors or than the residuals of the stored solution.
 
     Notes
     -----
-    The pairs have been tested against chance before; what is tested here is the map.
+    The pairs have already been tested against chance; this function tests the map.
     """
     statistics = calibration.statistics
     residuals = statistics["residuals"]
@@ -103,25 +103,25 @@ def check_solution(frame, calibration, *, stored=None, known=False):
 
 
 def shortcomings(frame, calibration, *, held, known=False, stored=None):
-    """List what a delivered solution lacks.
+    """List the shortcomings of a delivered solution.
 
     Parameters
     ----------
     frame : MatchedFrame
         The frame.
     calibration : Calibration
-        With matches, uncertainty and statistics.
+        Calibration of the frame, with matches, uncertainty and statistics.
     held : (N,) ndarray of bool
-        Matches that were held out on purpose.
+        Mask of the matches that were held out of the fit.
     known : bool, optional
-        Whether other detectors or a stored solution know the distortion.
+        Whether other detectors or a stored solution determine the distortion.
     stored : DistortionSolution, optional
         The stored solution that was used.
 
     Returns
     -------
     list of str
-        Reasons, each with its figure; none for a solution that is as good as can be wished.
+        Reasons with their numbers; empty if the solution has no shortcomings.
     """
     reasons = []
     ny, nx = frame.image_shape
@@ -200,30 +200,7 @@ def _few_detections(frame, match):
 
 
 def coverage(x, y, image_shape):
-    """Share of a detector within the outline of some stars.
-
-    Parameters
-    ----------
-    x, y : (N,) array_like
-        Their pixels.
-    image_shape : (int, int)
-        Shape ``(ny, nx)``.
-
-    Returns
-    -------
-    float
-        Area of their convex hull over that of the detector.
-    """
-    if len(x) < 3:
-        return 0.0
-    try:
-        return float(ConvexHull(np.stack([x, y], axis=1)).volume / np.prod(image_shape))
-    except QhullError:
-        return 0.0
-
-
-def largest_hole(x, y, image_shape):
-    """Share of a detector that the largest circle without stars covers.
+    """Return the fraction of a detector within the outline of some stars.
 
     Parameters
     ----------
@@ -235,8 +212,31 @@ def largest_hole(x, y, image_shape):
     Returns
     -------
     float
-        Area of the circle, with the detector stretched to a square, over that of the detector;
-        1 where there are no stars.
+        Area of the convex hull of the stars divided by that of the detector.
+    """
+    if len(x) < 3:
+        return 0.0
+    try:
+        return float(ConvexHull(np.stack([x, y], axis=1)).volume / np.prod(image_shape))
+    except QhullError:
+        return 0.0
+
+
+def largest_hole(x, y, image_shape):
+    """Return the fraction of a detector that the largest circle without stars covers.
+
+    Parameters
+    ----------
+    x, y : (N,) array_like
+        Pixels of the stars.
+    image_shape : (int, int)
+        Shape ``(ny, nx)``.
+
+    Returns
+    -------
+    float
+        Area of the circle divided by that of the detector, with the detector stretched to a
+        square; 1 if there are no stars.
     """
     if not len(x):
         return 1.0
@@ -245,13 +245,13 @@ def largest_hole(x, y, image_shape):
     u, v = (a.ravel() for a in np.meshgrid(nodes, nodes))
     stars = np.stack([(np.asarray(x) + 0.5) / nx, (np.asarray(y) + 0.5) / ny], axis=1)
     distance, _ = cKDTree(stars).query(np.stack([u, v], axis=1))
-    # Circles that reach over the rim would be as large for stars all over the detector.
+    # Near the edge, large empty circles are normal, so they do not count beyond it.
     rim = np.min([u, 1 - u, v, 1 - v], axis=0)
     return float(np.pi * np.max(np.minimum(distance, rim)) ** 2)
 
 
 def _offset_of_parts(matches, used, image_shape, statistics):
-    """Tell of parts of the frame that are off as a whole, or None."""
+    """Describe parts of the frame that are off as a whole; `None` if there are none."""
     sigma = max(statistics["residuals"]["sigma_dx"], statistics["residuals"]["sigma_dy"])
     columns = [np.asarray(matches[c], float)[used] for c in ("x", "y", "dx", "dy")]
     mean_dx, mean_dy, count = binned_residuals(*columns, image_shape=image_shape, n_bins=4)

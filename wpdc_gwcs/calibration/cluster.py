@@ -125,7 +125,7 @@ class _WatchedExecutor(Executor):
                 raise self._error
             self._waiting.add(future)
         with warnings.catch_warnings():
-            # Frames that have been matched together are some 10 MB, from which on Dask warns.
+            # Frames that are solved together have about 10 MB, for which Dask issues a warning.
             warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
             inner = self._pool.submit(fn, *args, **kwargs)
         inner.add_done_callback(partial(self._pass_on, future))

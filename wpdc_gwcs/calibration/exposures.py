@@ -1,4 +1,4 @@
-"""Which frames are one exposure: what their headers say, checked against each other."""
+"""Frames of one exposure: the claims of their headers, checked against each other."""
 
 import re
 import warnings
@@ -12,38 +12,40 @@ from wpdc_gwcs.exceptions import WPDCWarning
 
 __all__ = ["tie_exposures"]
 
-# Detectors of one exposure begin within this time of each other, s: the shutter takes a second or
-# two, and the next exposure does not begin before the first is read out.
+# Detectors of one exposure start within this time of each other, s: the shutter takes a second or
+# two, and the next exposure does not start before the readout of the first.
 _SAME_START = 5.0
-# Detectors of one camera are not further apart than this, in diagonals of a detector: a camera of
-# 15 x 15, the largest there is, measures 14 between its outermost centers.
+# Largest distance between detectors of one camera, in diagonals of a detector: the largest existing
+# camera, with 15 x 15 detectors, has 14 between its outermost centers.
 _FARTHEST = 20.0
 
 
 def tie_exposures(frames):
-    """Keep together only those frames that can be of one exposure.
+    """Tie only those frames together that can belong to one exposure.
 
     Parameters
     ----------
     frames : list of Frame
-        With the keys that their headers gave.
+        Frames with the camera and exposure from their headers.
 
     Returns
     -------
     list of Frame
-        The same frames, in order; some with another ``exposure``, or `None` if they are on their
-        own.
+        The same frames in the same order; some have another ``exposure``, or `None` if they are
+        taken on their own.
 
     Warns
     -----
     WPDCWarning
-        If frames with one key point to different parts of the sky, or are twice of one detector.
+        If frames of one exposure point to different parts of the sky, or two of them are from the
+        same detector.
 
     Notes
     -----
-    Frames of one key that began at different times are different exposures: some observatories give
-    one identifier to several exposures, or begin to count anew each night.  Where a detector is
-    still there twice, the frames of a file stay together, else those with one tangent point.
+    Frames with the same identifier but different start times are different exposures: some
+    observatories use an identifier for several exposures, or restart their numbers every night.
+    If a detector still occurs twice, the frames of each file stay together, or else those with the
+    same tangent point.
     """
     groups = {}
     for row, frame in enumerate(frames):
@@ -84,7 +86,7 @@ def _by_place(frames, rows):
     places = np.array(places)
     if not np.isfinite(places).all():
         return [rows]
-    # chords of the unit sphere: straight distances need no care at the poles
+    # Chords of the unit sphere have no special cases at the poles.
     reach = 2 * np.sin(min(_FARTHEST * float(np.median(sizes)), np.pi) / 2)
     tree, left, parts = cKDTree(places), set(range(len(rows))), []
     while left:

@@ -1,8 +1,8 @@
-"""Reference stars whose places are unknowns: where the catalog is worse than the camera.
+"""Reference stars with free positions, for catalogs that are less accurate than the camera.
 
 ::
 
-    all exposures of a star: measured place - catalog, +- centroid --others' mean--> its offset
+    all exposures of a star: measured - catalog position --mean of the others--> its offset
     exposures, catalog + offsets --solve--> the next solution
 """
 
@@ -19,14 +19,14 @@ __all__ = ["solve_free_stars"]
 
 log = logging.getLogger(__name__)
 
-# Rounds of offsets and solution.  Three bring exposures together to 0.4 of what the catalog leaves
-# them apart, where it is eight times worse than the centroids; fifteen to 0.3.
+# Rounds of offsets and solution.  With a catalog eight times worse than the centroids, three rounds
+# reduce the differences between exposures to 0.4 of those without offsets, fifteen to 0.3.
 _ROUNDS = 3
 
-# Stars of two or more exposures that must be there, to tell the errors of either side.
+# Minimum number of stars in two or more exposures, to distinguish the errors of both sides.
 _LEAST_STARS = 20
 
-# Least and greatest factor by which stated errors may be wrong.
+# Smallest and largest factor on the stated errors.
 _LEAST_SCALE, _MOST_SCALE = 0.2, 10.0
 
 _MAS = 3.6e6  # per deg
@@ -34,18 +34,18 @@ _MAS = 3.6e6  # per deg
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """How far stars were measured from their places in the catalog: columns of all pairs.
+    """Measured offsets of stars from their catalog positions: columns of all pairs.
 
     Parameters
     ----------
     star : (N,) ndarray of int
         Number of the star.
     offset : (2, N) ndarray
-        To the east and to the north, mas.
+        Offsets east and north, mas.
     centroid, catalog : (N,) ndarray
-        Stated variances of the two sides, mas^2; 0 where they are unknown.
+        Stated variances of centroids and catalog, mas^2; 0 where they are unknown.
     told : (N,) ndarray of bool
-        Pairs that the solution has used and whose errors are known.
+        Mask of the pairs that the solution used and whose errors are known.
     """
 
     star: np.ndarray
@@ -55,39 +55,41 @@ class _Pairs:
     told: np.ndarray
 
     def sums(self, values):
-        """Sum over the pairs of each star that tell."""
+        """Sum over the usable pairs of each star."""
         return np.bincount(self.star, np.where(self.told, values, 0.0))
 
 
 def solve_free_stars(exposures, result, solve):
-    r"""Solve again with the places of stars that several exposures have as unknowns.
+    r"""Solve again with free positions of the stars that occur in several exposures.
 
     Parameters
     ----------
     exposures : list of Exposure
-        With ``star`` and ``reference_err``.
+        Exposures with ``star`` and ``reference_err``.
     result : SolveResult
-        Of these exposures, with the catalog as it is.
+        Solution of these exposures with the unchanged catalog.
     solve : callable
-        Gives the `SolveResult` of a list of exposures.
+        Returns the `SolveResult` of a list of exposures.
 
     Returns
     -------
     SolveResult
-        With ``reference_offset`` of the exposures.  Residuals are those about the catalog.
-        Uncertainties, too, are those of the solution that takes the catalog as it is: offsets bring
-        the exposures together, but where all of them lie is still what the catalog says.
+        Solution with the ``reference_offset`` of each exposure.  Its residuals are relative to the
+        unchanged catalog.  Its uncertainties are those of ``result``: the offsets make the
+        exposures agree with each other, but their common position still comes from the catalog.
 
     Notes
     -----
-    The prior of an offset is the error of the catalog.  In each exposure a star stands where the
-    other ones, and the catalog, put it: with weights :math:`w = 1 / \sigma^2` of the centroids,
+    The prior of an offset is the error of the catalog.  The position of a star in exposure i comes
+    from the catalog and the measured offsets :math:`o_j` of the other exposures.  With the weights
+    :math:`w = 1 / \sigma^2` of the centroids and the error :math:`\sigma_c` of the catalog, its
+    offset is
 
-    .. math:: d_i = \sum_{j \ne i} w_j o_j / (\sum_{j \ne i} w_j + 1 / \sigma_c^2) ,
+    .. math:: d_i = \frac{\sum_{j \ne i} w_j o_j}{\sum_{j \ne i} w_j + 1 / \sigma_c^2} ,
 
-    with the error of this mean, so that no pair is held against itself; then comes the solution,
-    then the offsets again.  Scales of the errors of both sides are learned from the scatter of the
-    pairs of each star and from that of their means.
+    so no pair is compared with itself.  Offsets and solution alternate.  Factors on the errors of
+    the centroids and of the catalog are learned from the scatter of the pairs of each star and from
+    the scatter of their means.
 
     References
     ----------
@@ -150,7 +152,7 @@ def _gather(exposures, moved, result):
 
 
 def _scales(pairs):
-    """Factors of the stated errors of centroids and catalog, `None` if too little tells."""
+    """Factors on the stated errors of centroids and catalog; `None` if there are too few stars."""
     weight = _inverse(pairs.centroid)
     n, total = pairs.sums(1.0), pairs.sums(weight)
     several = n >= 2

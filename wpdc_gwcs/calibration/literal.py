@@ -1,4 +1,4 @@
-"""The paper's literal solution of matched frames: tangent points of headers, pairs made anew."""
+"""The paper's literal solution of matched frames: header tangent points, and new pairs."""
 
 import numpy as np
 
@@ -20,9 +20,9 @@ def solve_frames_literally(group, settings, *, exposure_of, solution):
     group : list of MatchedFrame
         Matched frames of any detectors; each is solved by itself.
     settings : Settings
-        Choices.
+        Settings of the run.
     exposure_of : callable
-        ``exposure_of(frame, pairs, attitude)`` gives an `~wpdc_gwcs.solve.Exposure`.
+        ``exposure_of(frame, pairs, attitude)`` returns an `~wpdc_gwcs.solve.Exposure`.
     solution : dict
         Stored solutions by detector.
 
@@ -31,7 +31,7 @@ def solve_frames_literally(group, settings, *, exposure_of, solution):
     result : SolveResult
         Solutions and exposures.
     pairs : list of tuple
-        Pairs of each frame as they were matched last.
+        Pairs of each frame from the last match.
     """
     starts = [_tangent_point(frame, settings, solution) for frame in group]
     pairs = [frame.pairs for frame in group]
@@ -73,7 +73,7 @@ def _tangent_point(frame, settings, solution):
     center = detector_center(frame.image_shape)
     if settings.reference_point == "center":
         return linear_wcs(frame.wcs, center)
-    # "The matched source nearest to the detector center": there, it is where its star is.
+    # "The matched source nearest to the detector center": its star is the tangent point.
     i_src, i_ref = frame.pairs
     x, y = (np.asarray(frame.sources[c], float)[i_src] for c in "xy")
     nearest = int(np.argmin(np.hypot(x - center[0], y - center[1])))

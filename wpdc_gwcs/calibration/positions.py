@@ -26,7 +26,7 @@ def sky_positions(calibration, x, y, x_err, y_err):
     Parameters
     ----------
     calibration : Calibration
-        Of the frame.
+        Calibration of the frame.
     x, y : (N,) array_like
         Zero-based pixels.
     x_err, y_err : (N,) array_like
@@ -41,10 +41,10 @@ def sky_positions(calibration, x, y, x_err, y_err):
 
     Notes
     -----
-    With the covariance S of the centroid, the derivatives J of the undistorted position and its
-    covariance U (`~wpdc_gwcs.Calibration.uncertainty`), that on the sky is
-    ``T CD (J S J^T + U) CD^T T^T``, where T are the derivatives of the local plane east and north
-    by the tangent plane.
+    The covariance on the sky is ``T CD (J S J^T + U) CD^T T^T``, with the covariance S of the
+    centroid, the derivatives J of the undistorted position with respect to the pixel, the
+    covariance U of the undistorted position (`~wpdc_gwcs.Calibration.uncertainty`), and the
+    derivatives T of the local plane, east and north, with respect to the tangent plane.
     """
     x, y, x_err, y_err = (np.asarray(v, dtype=float) for v in (x, y, x_err, y_err))
     distortion = calibration.wcs.get_transform("detector", "undistorted")
@@ -68,23 +68,23 @@ def sky_positions(calibration, x, y, x_err, y_err):
 
 
 def with_sky_positions(calibration):
-    """Put the positions on the sky into the tables of sources and of matches.
+    """Add the positions on the sky to the tables of sources and of matches.
 
     Parameters
     ----------
     calibration : Calibration
-        Of a frame.
+        Calibration of a frame.
 
     Returns
     -------
     calibration : Calibration
-        Its ``sources`` have the columns of `sky_positions`; its ``matches``, whose ``ra`` and
-        ``dec`` are those of the reference star, have ``source_ra``, ``source_dec`` and their
-        errors.
+        Copy whose ``sources`` have the columns of `sky_positions`, and whose ``matches`` have
+        ``source_ra``, ``source_dec`` and their errors; there, ``ra`` and ``dec`` are those of the
+        reference star.
 
     Notes
     -----
-    Centroid errors are taken as the solution found them, with its scale and floor.
+    Centroid errors have the scale and the floor that the solution found.
     """
     matches, sources = calibration.matches, calibration.sources
     if matches is None:
@@ -105,7 +105,7 @@ def _of_table(calibration, table, typical):
     x, y = (np.asarray(table[name], float) for name in "xy")
     errors = [numbers_or_none(table, name) for name in ("x_err", "y_err")]
     if any(error is None for error in errors):
-        # Those that the solution found.
+        # The errors that the solution found.
         errors = [np.full(len(x), value) for value in typical]
     elif table is not calibration.matches:
         statistics = calibration.solution.statistics
