@@ -12,21 +12,21 @@ from wpdc_gwcs.robust import robust_scatter
 
 __all__ = ["Background", "subtract_background"]
 
-# Values further from the level than this, in standard deviations, are blanks of some kind; sums of
+# Values farther from the level than this, in standard deviations, are blanks of some kind; sums of
 # their squares would overflow float32.
 _BLANK = 1e10
 
-# Noise in counts for which counts are the unit: far from what the squares of float32 can hold.
+# Range of the noise in counts for which counts are the unit; the squares are within float32.
 _PLAIN = (1e-3, 1e6)
 
-# Pixels this many standard deviations below the background are dead: nothing on the sky is dark.
+# Pixels this many standard deviations below the background are dead, because no source is dark.
 _COLD = 10.0
 
-# Cells in px within which a weight map tells the noise of the sky: the median over them does not
-# see the photons of stars, which many maps of variances hold and which the gain brings.
+# Size in px of the cells in which a weight map gives the noise of the sky.  Many variance maps
+# include the photons of stars, which the gain accounts for; the median over a cell excludes them.
 _WEIGHT_CELL = 16
 
-# Pixels that may be saturated, in scatters of all pixels above their median: no sky reaches there.
+# Pixels that may be saturated, in units of the scatter above the median: no sky is so bright.
 _BRIGHT = 5.0
 
 
@@ -43,15 +43,15 @@ class Background:
     mask : (ny, nx) bool ndarray or None
         True where a pixel must not be used; None if all are good.
     level : float
-        Median of the background that was taken off, in counts.
+        Median of the subtracted background, in counts.
     bright : BrightPixels
-        The bright pixels as they came in.
+        The bright pixels of the original image.
     unit : float, optional
-        Counts in one unit of `image` and `rms`: 1 but for images whose noise is so small or great
-        in counts that squares of float32 would not hold it.
+        Counts in one unit of `image` and `rms`.  It is 1 unless the noise in counts is so small or
+        so large that its square does not fit into float32.
     photons : (ny, nx) float32 ndarray or None, optional
-        Variance of the photons of a star relative to that by the gain, if pixels differ in response
-        or exposure, which is known from a weight map or the filters of a mosaic; None otherwise.
+        Variance of the photons of a star relative to that from the gain, if a weight map or the
+        filters of a mosaic show that pixels differ in response or exposure; None otherwise.
 
     Examples
     --------
@@ -85,28 +85,28 @@ class Background:
         return float(np.median(self.rms[::step, ::step])) * self.unit
 
     def copy(self):
-        """Copy the pixels of the image and the mask, which may then be changed.
+        """Return a copy whose image and mask may be changed.
 
         Returns
         -------
         Background
-            Copy.
+            The copy.
         """
         mask = None if self.mask is None else self.mask.copy()
         return replace(self, image=self.image.copy(), mask=mask)
 
     def rows(self, start, stop):
-        """Take some rows: views of these, no copies.
+        """Return some of the rows.
 
         Parameters
         ----------
         start, stop : int
-            The first row, and the one behind the last.
+            The first row, and the row after the last one.
 
         Returns
         -------
         Background
-            The rows.
+            The rows, as views.
         """
         mask, photons = (
             None if values is None else values[start:stop] for values in (self.mask, self.photons)
@@ -122,17 +122,17 @@ class Background:
         )
 
     def saturated(self, level):
-        """Find the pixels that are saturated.
+        """Mark the saturated pixels.
 
         Parameters
         ----------
         level : float
-            Counts, background included, from which a pixel is.
+            Saturation level in counts, including the background.
 
         Returns
         -------
         (ny, nx) ndarray of bool
-            True for those that are; pixels hardly above the background never are.
+            True for saturated pixels.  Pixels hardly above the background never are.
         """
         full = np.zeros(self.image.shape, bool)
         high = self.bright.values >= level
@@ -142,31 +142,31 @@ class Background:
 
 @dataclass(frozen=True, eq=False)
 class BrightPixels:
-    """The bright pixels of an image, background included, which may be saturated.
+    """The bright pixels of an image, which may be saturated.
 
     Parameters
     ----------
     indices : (N,) ndarray of int
-        Their indices in the flat image, ascending.
+        Indices of the pixels in the flat image, ascending.
     values : (N,) ndarray
-        Their counts.
+        Counts, including the background.
     """
 
     indices: np.ndarray
     values: np.ndarray
 
     def between(self, start, stop):
-        """Take those of a part of the flat image.
+        """Return the bright pixels in a part of the flat image.
 
         Parameters
         ----------
         start, stop : int
-            The first place, and the one behind the last.
+            The first index, and the index after the last one.
 
         Returns
         -------
         BrightPixels
-            With places in that part.
+            Bright pixels with indices in that part.
         """
         k = slice(*np.searchsorted(self.indices, [start, stop]))
         return BrightPixels(self.indices[k] - start, self.values[k])
@@ -180,14 +180,14 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
     data : (ny, nx) array_like
         Image of any real type, byte order and unit.
     mask : (ny, nx) array_like of bool, optional
-        True where a pixel must not be used.  NaN and infinite pixels never are, nor those far
-        below the background.
+        True where a pixel must not be used.  NaN and infinite pixels, and pixels far below the
+        background, are not used in any case.
     weight : (ny, nx) array_like, optional
-        Inverse variance of the background, of any scale; pixels whose weight is not positive are
+        Inverse variance of the background on any scale.  Pixels whose weight is not positive are
         not used.
     mesh : int, optional
-        Size in px, about, of the cells within which the background is estimated: cells of equal
-        sizes fill the image.
+        Approximate size in px of the cells in which the background is estimated, at least 4.  Cells
+        of equal size fill the image.
     filter_size : int, optional
         Size in cells of the median filter over the cells.
     overwrite : bool, optional
@@ -203,17 +203,18 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
     TypeError
         If the image is not of a real number type.
     ValueError
-        If the image is not two-dimensional, or the mask or the weight has another shape.
+        If the image is not two-dimensional or smaller than 8 x 8 px, if the mask or the weight has
+        another shape, or if ``mesh`` or ``filter_size`` is too small.
     DetectionError
         If the image has no finite pixels, or no noise.
 
     Notes
     -----
-    The background is the mode of every cell after clipping (Bertin & Arnouts 1996, A&AS 117, 393),
-    median filtered and interpolated by bicubic splines.  Pixels that are equal to most others of
-    their cell (padding, dead regions) are masked.  The raw mosaic of a color camera is recognized
-    by a pattern of 2 x 2 px.  It has a background for each of the four planes, which are scaled to
-    the same response to stars.
+    The background is the mode of each cell after clipping (Bertin & Arnouts 1996, A&AS 117, 393),
+    smoothed by a median filter and interpolated by bicubic splines.  Pixels that are equal to most
+    other pixels of their cell (padding, dead regions) are masked.  The raw mosaic of a color camera
+    is recognized by its pattern of 2 x 2 px.  Each of its four planes has its own background, and
+    they are scaled to the same response to stars.
 
     Examples
     --------
@@ -230,7 +231,7 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
         raise ValueError(f"the image must be 2-D and at least 8 x 8 px, got shape {data.shape}")
     if mesh < 4 or filter_size < 1:
         raise ValueError(f"mesh must be >= 4 and filter_size >= 1, got {mesh}, {filter_size}")
-    # Most images are whole, which their extremes tell without an array of their own.
+    # Most images have no blank pixels: their extremes show this without a mask of the whole image.
     extremes = np.array([data.min(), data.max()], dtype=float)
     blank = None if np.isfinite(extremes).all() else ~np.isfinite(data)
     bad = blank
@@ -246,7 +247,7 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
         bad = None
     pedestal, scale = _level_and_scatter(data, bad)
     if not np.abs(extremes - pedestal).max() < _BLANK * scale:
-        # Compared apart: differences of integers could overflow.
+        # Two comparisons, because differences of integers could overflow.
         blank = ~((data > pedestal - _BLANK * scale) & (data < pedestal + _BLANK * scale))
         bad = blank if bad is None else bad | blank
     # A power of two, so that nothing is rounded.
@@ -295,7 +296,7 @@ def subtract_background(data, *, mask=None, weight=None, mesh=64, filter_size=3,
 
 
 def _bright_pixels(data, limit):
-    """Pixels above a limit, masked ones too."""
+    """Pixels above a limit, including masked ones."""
     indices, values = [], []
     strips = row_strips(data.shape)
     work = np.empty((strips[0].stop, data.shape[1]), bool)
@@ -308,14 +309,14 @@ def _bright_pixels(data, limit):
 
 
 def _finished(background):
-    """Mask what lies far below the sky."""
+    """Mask the pixels far below the sky."""
     image, rms, bad = background.image, background.rms, background.mask
     noise = np.sqrt(np.median(rms[:: max(1, len(rms) // 500)] ** 2))
     if not (np.isfinite(noise) and noise > 0):
         raise DetectionError(
             f"the image is flat: all pixels near {background.level:g}, no noise, no stars"
         )
-    # Most images have no such pixels, which their extremes tell.
+    # Most images have no such pixels, as their extremes show.
     if not image.min() < -_COLD * rms.min():
         return background
     bad = np.zeros(image.shape, bool) if bad is None else bad.copy()
@@ -326,7 +327,7 @@ def _finished(background):
 
 
 def _level_and_scatter(data, bad):
-    """Median of an image, and the scatter about it: what its unit is chosen by."""
+    """Median of an image and the scatter about it, from which its unit is chosen."""
     stride = max(1, min(data.shape) // 500)
     sample = data[::stride, ::stride]
     if bad is not None:
@@ -338,7 +339,7 @@ def _level_and_scatter(data, bad):
     pedestal = float(np.median(sample))
     scatter = robust_scatter(sample)
     if not scatter > 0:
-        # Padding, or counts of few photons: what differs tells the scale.
+        # Padding, or counts of few photons: only the other pixels show the scale.
         other = np.abs(sample[sample != pedestal] - pedestal)
         scatter = float(np.median(other)) if other.size else 0.0
     if not scatter > 0:
@@ -363,10 +364,11 @@ def _in_units(data, pedestal, unit, *, overwrite):
 
 
 def _relative_photons(relative):
-    """Variance of photons where pixels differ in response or exposure by this noise of the sky.
+    """Relative variance of photons, if the relative noise of the sky shows different responses.
 
-    With response s it goes as 1/s, that of the sky as 1/s if its own photons make it, as 1/s^2 if
-    the readout does: between the two.  The gain is that of the best pixels.
+    With the response s, the variance of photons is proportional to 1/s.  That of the sky is
+    proportional to 1/s if it comes from photons, and to 1/s^2 if it comes from the readout, so a
+    value between the two is used.  The gain is that of the best pixels.
     """
     step = max(1, min(relative.shape) // 500)
     best = np.percentile(relative[::step, ::step], 5)
@@ -374,7 +376,7 @@ def _relative_photons(relative):
 
 
 def _relative_noise(weight, bad):
-    """Noise of the sky by a weight map, relative to its median over the image."""
+    """Noise of the sky from a weight map, relative to its median over the image."""
     variance = np.full(weight.shape, np.nan, dtype=np.float32)
     good = np.isfinite(weight) & (weight > 0)
     if bad is not None:

@@ -1,4 +1,4 @@
-"""The level of the sky and its scatter in cells of an image: counts of their pixels, clipped."""
+"""The level of the sky and its scatter in cells of an image, from clipped histograms."""
 
 import numpy as np
 
@@ -6,23 +6,23 @@ from wpdc_gwcs import kernels
 
 __all__ = ["measure_cells"]
 
-# Pixels of a cell that tell where its values are counted: this many by this many.
+# Sample of the pixels of a cell that sets the range of its histogram: this many by this many.
 _SAMPLED = 10
 
-# Steps per median deviation of these pixels: 16 per standard deviation of the sky, if they are of
-# the sky, so that the 256 steps reach to 8 on either side.
+# Steps of the histogram per median deviation of the sample: 16 per standard deviation of the sky,
+# so that the 256 steps reach 8 standard deviations on each side.
 _RATE = 10.8
 
-# Pixels further from the median than this, in standard deviations, are not those of the sky.
+# Pixels farther from the median than this, in standard deviations, are not sky.
 _CLIP = 3.0
 _MAX_CLIPS = 50
 
-# Share of other values from which the sky is of few photons, most pixels having none, and not
-# constant with outliers.
+# Minimum fraction of different values for a sky of few photons, where most pixels have none.  With
+# fewer, the cell is constant with outliers.
 _MIN_OTHER = 0.01
 
-# Difference between mean and median, in standard deviations, up to which the relation between
-# mean, median and mode holds that few stars bring.
+# Largest difference between mean and median, in standard deviations, for which the relation between
+# mean, median and mode is valid, as for a sky with few stars.
 _MAX_SKEW = 0.3
 
 
@@ -34,31 +34,31 @@ def measure_cells(image, mask, rows, columns, scale):
     image : (ny, nx) float32 ndarray
         The image, C-contiguous.
     mask : (ny, nx) bool ndarray or None
-        True for pixels that do not count.
+        True for pixels that are not used.
     rows, columns : (M + 1,), (N + 1,) ndarray of int
-        First rows and columns of the cells, and those behind the last ones.
+        First rows and columns of the cells, followed by the row and column after the last cell.
     scale : float
-        Scatter of the image, for cells most of whose pixels are equal.
+        Scatter of the image, which is used for cells in which most pixels are equal.
 
     Returns
     -------
     level, scatter : (M * N,) ndarray
-        Mode and standard deviation of the pixels that are left after clipping.
+        Mode and standard deviation of the pixels after clipping.
     number : (M * N,) ndarray
-        Number of pixels of about this level.
+        Number of pixels within the range of the histogram.
     mean, deviation : (M * N,) ndarray
-        Mean and standard deviation of these without clipping; the latter is 0 where the clipping
-        takes out no more than outliers.
+        Mean and standard deviation of these pixels before clipping; the deviation is 0 if the
+        clipping removes only outliers.
     """
     middle, spread = _sampled(image, mask, rows, columns)
     spread[~(spread > 0)] = scale
     rate = (_RATE / spread).astype(np.float32)
-    # The median lies in the middle of a step, so that values in units lie evenly about the middles.
+    # The median is at the center of a step, so that integer values are even about the centers.
     low = (middle - (kernels.N_STEPS / 2 + 0.5) / _RATE * spread).astype(np.float32)
     counts = np.empty((len(low), kernels.N_STEPS), np.intc)
     kernels.count_levels(image, mask, rows.astype(float), columns.astype(float), low, rate, counts)
     level, scatter, number, mean, deviation = _clip(counts)
-    # The values of a step lie about its middle.
+    # The values of a step are about its center.
     level, mean = (low + (step + 0.5) / rate for step in (level, mean))
     return level, scatter / rate, number, mean, deviation / rate
 
@@ -78,7 +78,7 @@ def _sampled(image, mask, rows, columns):
 
 
 def _sorted_median(sample):
-    """Median of every row, whose NaN do not count; 0 where there is nothing else."""
+    """Median of every row without NaN; 0 for a row of NaN only."""
     ordered = np.sort(sample, axis=1)
     number = np.isfinite(ordered).sum(axis=1)
     row = np.arange(len(ordered))
@@ -87,7 +87,7 @@ def _sorted_median(sample):
 
 
 def _clip(counts):
-    """Do what `measure_cells` does, in steps of counts."""
+    """Return the results of `measure_cells` from histograms, in steps."""
     n_cells, n_steps = counts.shape
     step, row = np.arange(n_steps), np.arange(n_cells)
     below = np.zeros((3, n_cells, n_steps + 1), np.int64)
@@ -116,15 +116,15 @@ def _clip(counts):
 
 
 def _medians(number):
-    """Return what finds medians of counts between steps, by the numbers of pixels below each.
+    """Return a function for medians between two steps, from the numbers of pixels below each step.
 
-    Values that come in units, as those of raw frames, fill one step in several.  Those in one step
-    are taken as spread over the room between the filled ones: the median of the steps themselves
-    would be off by up to half a unit.
+    Integer values, as in raw frames, fill only one of several steps.  The pixels in a step are
+    assumed to be spread over the space between the filled steps; otherwise, the median would be off
+    by up to half a unit.
     """
     n_cells, n_edges = number.shape
     row = np.arange(n_cells)
-    # All cells one behind the other ascend: a search in them is one in each.
+    # Joined with shifts, the numbers of all cells ascend, so one search serves all of them.
     shift = (number[:, -1].max() + 1) * row
     ascending = (number + shift[:, None]).ravel()
 
@@ -135,7 +135,7 @@ def _medians(number):
         half = (number[row, first] + number[row, last]) / 2
         step = np.clip(find(half, "left") - 1, 0, n_edges - 2)
         low, high = number[row, step], number[row, step + 1]
-        # The nearer filled step: the next one where values are not in units.
+        # The nearer filled step; it is the next one if the values are not integers.
         before, after = find(low, "left") - 1, find(high, "right") - 1
         below = np.where(before < 0, n_edges, step - before)
         above = np.where(after >= n_edges - 1, n_edges, after - step)

@@ -14,29 +14,28 @@ __all__ = ["extract_peaks", "is_broad", "search", "star_size", "typical_fwhm"]
 # not to merge neighbors.
 _LINE = np.array([1.0, 2.0, 1.0]) / 4
 
-# Stars broader than this, FWHM in px, would fall to pieces under that kernel: the noise makes peaks
-# of their own on rings and trails.
+# Stars with a larger FWHM (px) would be split with this kernel, because noise causes separate peaks
+# on rings and trails.
 _BROAD = 4.5
 
-# Rows searched at a time, and their overlap: every source is taken whole, from the strip that holds
-# its peak.
+# Number of rows in a strip, and their overlap: every source comes whole from the strip with its
+# peak.
 _STRIP = 1024
 _OVERLAP = 64
 
-# Pixels that sep has room for beyond those of sources; and the share of pixels that noise alone
-# lifts above the threshold before it is smoothed: they need room only where noise is correlated,
-# and that much there is.
+# Number of pixels for which sep has room in addition to those of sources, in a strip and in a
+# window, and the fraction of pixels that noise alone may lift above the threshold.
 _ROOM, _ROOM_IN_WINDOW = 300_000, 1000
 _BY_CHANCE = 0.03
-# One in this many rows is used to estimate the number of pixels of sources.
+# One of this many rows is used to estimate the number of pixels in sources.
 _SAMPLED = 4
-# Branches of a source that sep can hold.
+# Maximum number of branches of a source in sep.
 _BRANCHES = 8192
 
-# Share of an image from which on windows about what is high would be no less work than all of it.
+# Fraction of bright cells above which windows around them save no time.
 _CROWDED = 0.15
 
-# Sources that tell the size of the stars.
+# Number of sources from which the size of the stars is measured.
 _N_BRIGHT = 500
 
 
@@ -48,16 +47,16 @@ def extract_peaks(background, threshold, deblend_contrast, fwhm=0.0):
     background : Background
         Image without background.
     threshold : float
-        Least significance of a peak.
+        Smallest significance of a peak.
     deblend_contrast : float
-        Least share of the flux of a peak within a larger source.
+        Smallest fraction of the flux for a separate peak within a larger source.
     fwhm : float, optional
-        FWHM of the stars, px; broad stars are searched with an equally broad filter.
+        FWHM of the stars, px; for broad stars, the filter is equally broad.
 
     Returns
     -------
     structured array
-        As from `sep.extract`.
+        The result of `sep.extract`.
     """
     parts = []
     for start, _, found in search(background, threshold, deblend_contrast, fwhm):
@@ -72,20 +71,21 @@ def search(background, threshold, deblend_contrast, fwhm=0.0, *, sparse=False):
     Parameters
     ----------
     background : Background
-        Image without background, or what gives its rows.
+        Image without background, or an object that provides its rows.
     threshold, deblend_contrast, fwhm
         As for `extract_peaks`.
     sparse : bool, optional
-        Whether most of the image is expected to have no peak: sep then sees only what has.
+        Whether most of the image is expected to have no peaks, so that sep gets only windows around
+        bright pixels.
 
     Yields
     ------
     start : int
-        First row of a strip.
+        First row of the strip.
     strip : Background
-        The strip: rows around those whose peaks are looked for.
+        The strip, including its overlap with others.
     found : structured array
-        As from `sep.extract`, in pixels of the strip.
+        Peaks as from `sep.extract`, in pixels of the strip.
     """
     line = _line(fwhm)
     options = {
@@ -114,7 +114,7 @@ def search(background, threshold, deblend_contrast, fwhm=0.0, *, sparse=False):
 
 def _extract(strip, options):
     """Extract the peaks of a strip."""
-    # Room for all pixels of all sources; no more, because sep writes to all of it every time.
+    # Room for all pixels of all sources, and no more, because sep writes to all of it every time.
     high = high_pixels(strip.image[::_SAMPLED], strip.rms[::_SAMPLED], options["thresh"])
     active = _SAMPLED * sum(np.count_nonzero(part) for _, part in high)
     active -= int(_BY_CHANCE * strip.image.size)
@@ -123,7 +123,7 @@ def _extract(strip, options):
 
 
 def _extract_in_windows(strip, cells, options):
-    """Extract the peaks of each window of a strip about the cells in which something is high.
+    """Extract the peaks of each window of a strip around its bright cells.
 
     A source does not reach beyond these cells, so it has the same pixels in a window.
     """
@@ -139,20 +139,20 @@ def _extract_in_windows(strip, cells, options):
     corners = np.array([[columns.start, rows.start] for rows, columns in places])
     number = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     _shift(found, *corners[number].T)
-    # Where windows overlap, each source is taken from its own.
+    # If windows overlap, each source is taken from its own window.
     return found[labels[found["ycpeak"] // CELL, found["xcpeak"] // CELL] == number + 1]
 
 
 def _call_sep(image, rms, mask, room, options):
-    """Extract the peaks of an image, with room for so many pixels of sources."""
+    """Extract the peaks of an image, with room for a given number of pixels in sources."""
     before = sep.get_extract_pixstack(), sep.get_sub_object_limit()
     sep.set_extract_pixstack(room)
-    # The default is for small images: sep gives up where more branches are active.
+    # The default of sep is for small images, and it fails with more active branches.
     sep.set_sub_object_limit(_BRANCHES)
     try:
         return sep.extract(image, err=rms, mask=mask, minarea=3, filter_type="conv", **options)
     finally:
-        # Others may use sep too.
+        # Other code may use sep, too.
         sep.set_extract_pixstack(before[0])
         sep.set_sub_object_limit(before[1])
 
@@ -165,7 +165,7 @@ def _shift(found, dx, dy):
 
 
 def is_broad(fwhm):
-    """Return whether stars of this FWHM in px need a broader filter.
+    """Return whether stars of this FWHM need a broader filter.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def is_broad(fwhm):
     Returns
     -------
     bool
-        True from 4.5 px on.
+        True for 4.5 px or more.
     """
     return fwhm > _BROAD
 
@@ -191,7 +191,7 @@ def _line(fwhm):
 
 
 def typical_fwhm(background, found):
-    """Find the FWHM of the stars in px: that of the brightest sources that are not saturated.
+    """Find the FWHM of the stars from the brightest sources that are not saturated.
 
     Parameters
     ----------
@@ -203,14 +203,14 @@ def typical_fwhm(background, found):
     Returns
     -------
     float
-        FWHM.
+        FWHM, px.
     """
     good = (found["npix"] >= 5) & (found["peak"] < 0.7 * found["peak"].max())
     rows = np.flatnonzero(good if good.sum() >= 5 else np.ones(len(found), bool))
     rows = rows[np.argsort(found["cpeak"][rows])[::-1][:_N_BRIGHT]]
     size = star_size(background.image, found["x"][rows], found["y"][rows])
     if size is None:
-        # All noise, or broader than any window: stay with the isophotal size.
+        # Only noise, or sources broader than any window: use the isophotal size.
         size = [2.35 * float(np.median(np.sqrt(found["a"][rows] * found["b"][rows])))]
     return float(np.clip(size[0], 1.0, 0.1 * min(background.image.shape)))
 
@@ -223,12 +223,13 @@ def star_size(image, x, y):
     image : (ny, nx) ndarray
         Image without background.
     x, y : (N,) ndarray
-        Positions.
+        Positions of the sources, px.
 
     Returns
     -------
     (float, float) or None
-        FWHM in px as a circle and along the minor axis, None where no source tells.
+        FWHM of a circular star of the same size, and FWHM along the minor axis, px; None if no
+        source has a size.
     """
     xc, yc = np.rint(x).astype(int), np.rint(y).astype(int)
     fwhm = sharpest = 2.0

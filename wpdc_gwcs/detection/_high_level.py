@@ -1,4 +1,4 @@
-"""Public functions of the detection: arguments checked, tables out."""
+"""Public functions of the detection, which check arguments and return tables."""
 
 import logging
 
@@ -24,17 +24,17 @@ __all__ = ["detect_companions", "detect_sources"]
 
 log = logging.getLogger(__name__)
 
-# A neighbor's light at the center of a source, relative to the source's own, from which the fit
-# of both together is no longer as good as that of a single star.
+# Light of a neighbor at the center of a source, relative to that of the source, above which a fit
+# of both together is not as good as that of a single star.
 _MAX_SHARE = 0.15
 
-# Nearest that two sources are told apart, in FWHM.
+# Smallest distance of two separate sources, in FWHM.
 _RESOLVED = 0.6
 
-# Sources that tell what stars look like, by signal-to-noise ratio.
+# Minimum signal-to-noise ratio of the sources that show what stars look like.
 _STAR_SNR = 30.0
 
-# Columns of sources, in this order; and flags.
+# Columns of the sources, in this order.
 _COLUMNS = (
     "x",
     "y",
@@ -49,7 +49,7 @@ _COLUMNS = (
     "sharpness",
 )
 
-# Sources measured at a time: bounds the memory for their cut-outs to some tens of MB.
+# Number of sources measured at a time, which limits the memory for their cut-outs to tens of MB.
 _CHUNK = 20_000
 
 
@@ -67,28 +67,28 @@ def detect_sources(
     Parameters
     ----------
     data : Background or (ny, nx) array_like
-        Image without background, or a plain image, whose background is then subtracted and whose
-        hits are masked.
+        Image without background, or a plain image.  In a plain image, cosmic-ray hits are masked
+        after its background has been subtracted.
     threshold : float, optional
         Smallest significance of the peak of a source, in standard deviations of the smoothed noise.
     mask : (ny, nx) array_like of bool, optional
         True where a pixel must not be used; only for a plain image.
     gain : float, optional
-        Electrons per count, for the photon noise in the errors; without it, only the noise of the
+        Electrons per count, for the photon noise in the errors.  Default: only the noise of the
         background is used.
     saturation : float, optional
-        Counts, background included, from which a pixel is saturated.  If not given, it is the
-        plateau of the brightest pixels, if they have one.
+        Saturation level in counts, including the background.  Default: the plateau of the brightest
+        pixels, if there is one.
     deblend_contrast : float, optional
-        Smallest share of the flux for which a peak within a larger source is a separate source.
+        Smallest fraction of the flux for a separate peak within a larger source.
 
     Returns
     -------
     `~astropy.table.Table`
         One row per source, in the order found: ``x``, ``y`` (windowed centroid, px, zero based),
         ``x_err``, ``y_err`` (px), ``flux``, ``flux_err`` (counts), ``snr``, ``peak`` (counts above
-        background), ``fwhm`` (px), ``roundness``, ``sharpness``, ``flags``.  The meta data holds
-        ``fwhm`` and ``ellipticity``, those of a typical star, and ``saturation``.
+        background), ``fwhm`` (px), ``roundness``, ``sharpness``, ``flags``.  The metadata has
+        ``fwhm`` and ``ellipticity`` of a typical star, and ``saturation``.
 
     Raises
     ------
@@ -100,16 +100,17 @@ def detect_sources(
     Notes
     -----
     Sources are extracted by `sep` (Bertin & Arnouts 1996, A&AS 117, 393) after smoothing with a
-    3 x 3 kernel; positions are its windowed centroids with a Gaussian window of the stars' FWHM.
-    With window :math:`w`, pixels :math:`I_i` of noise :math:`\sigma_i`, the error is
+    3 x 3 kernel, or a broader one for broad stars.  Positions are its windowed centroids, with a
+    Gaussian window of the stars' FWHM.  With the window :math:`w_i` and the noise :math:`\sigma_i`
+    of the pixels :math:`I_i`, the error is
 
     .. math::
         \sigma_x^2 = 4 \sum w_i^2 \sigma_i^2 (x_i - x)^2 / \left(\sum w_i I_i\right)^2 .
 
-    ``fwhm`` comes from the second moments under the same window, with the window taken out.
-    ``roundness`` is DAOFIND's GROUND, :math:`2 (h_x - h_y) / (h_x + h_y)`, with the heights of
-    Gaussians fitted to the marginal distributions (Stetson 1987, PASP 99, 191), and ``sharpness``
-    is DAOFIND's, both as in `photutils.detection.DAOStarFinder`.
+    ``fwhm`` comes from the second moments under the same window, corrected for the window.
+    ``roundness`` is DAOFIND's GROUND, :math:`2 (h_x - h_y) / (h_x + h_y)`, with the heights h of
+    Gaussians fitted to the marginal distributions (Stetson 1987, PASP 99, 191).  ``sharpness`` is
+    that of DAOFIND.  Both are as in `photutils.detection.DAOStarFinder`.
 
     Examples
     --------
@@ -149,33 +150,33 @@ def detect_sources(
 
 
 def detect_companions(residual, sources, *, threshold=5.0, gain=None, deblend_contrast=0.002):
-    """Add the sources that show once the known ones are subtracted.
+    """Add the sources that are found after the known ones have been subtracted.
 
     Parameters
     ----------
     residual : Background
-        Image without the known sources, and the noise with their models' error, as from
-        `wpdc_gwcs.centroids.subtract_stars`; or any object with its ``shape`` that gives its
-        ``rows(start, stop)``.
+        Image without the known sources, with the errors of their models in its noise, as from
+        `wpdc_gwcs.centroids.subtract_stars`; or any object that has its ``shape`` and returns its
+        ``rows(start, stop)``, as from `wpdc_gwcs.centroids.residual_of`.
     sources : `~astropy.table.Table`
         The known sources, from `detect_sources`.
     threshold : float, optional
         Smallest significance of the peak of a source, in standard deviations of the smoothed noise.
     gain : float, optional
-        Electrons per count.
+        Electrons per count, for the photon noise in the errors.
     deblend_contrast : float, optional
-        Smallest share of the flux for which a peak within a larger source is a separate source.
+        Smallest fraction of the flux for a separate peak within a larger source.
 
     Returns
     -------
     `~astropy.table.Table`
-        The known sources, then the new ones; `FLAG_BLENDED` is set anew for all.
+        The known sources, followed by the new ones.  `FLAG_BLENDED` is set again for all of them.
 
     Notes
     -----
-    A threshold finds no peak on the flank of a brighter star, and the light there moves the center
-    of that star's fit.  What is nearer than 0.6 FWHM to a known source is not told from an error of
-    the PSF and left alone.
+    A source on the flank of a brighter star has no peak of its own, and its light shifts the fit of
+    that star.  Sources closer than 0.6 FWHM to a known one are not added, because an error of the
+    PSF looks the same.
 
     Examples
     --------
@@ -223,7 +224,7 @@ def _places(table):
 
 
 def _measure(background, found, fwhm, gain, saturation):
-    """Measure all sources by themselves; returns columns, in counts."""
+    """Measure each source by itself; returns columns, in counts."""
     image, rms, bad, unit = background.image, background.rms, background.mask, background.unit
     gain = None if gain is None else gain * unit
     full = None if saturation is None else background.saturated(saturation)
@@ -242,7 +243,7 @@ def _measure(background, found, fwhm, gain, saturation):
 
 
 def _table_of(parts, fwhm):
-    """Table of the sources measured, with the flags that tell them from each other."""
+    """Table of the measured sources, with the flags that depend on the other sources."""
     shapes = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     x, y, flux = (shapes[name] for name in ("x", "y", "flux"))
     flags, minor, size = (shapes.pop(name) for name in ("flags", "minor", "fwhm"))
@@ -255,7 +256,7 @@ def _table_of(parts, fwhm):
 
 
 def _windowed(background, found, sigma, fwhm):
-    """Windowed centroids; the isophotal ones where the window ran away to a neighbor."""
+    """Windowed centroids; the isophotal ones if the window has moved to a neighbor."""
     x, y = found["x"].astype(float), found["y"].astype(float)
     xw, yw, _ = sep.winpos(
         background.image, found["xcpeak"], found["ycpeak"], sigma, mask=background.mask, subpix=5
@@ -276,7 +277,7 @@ def _ellipticity(minor, size, snr, flags):
 
 
 def _unlike_stars(minor, size, snr, flags):
-    """Flag what is clearly sharper or broader than the stars of this image."""
+    """Flag sources that are clearly sharper or broader than the stars of this image."""
     result = np.zeros(len(size), int)
     bright = (flags == 0) & (snr > _STAR_SNR) & np.isfinite(size)
     if bright.sum() < 10:
@@ -298,7 +299,7 @@ def _unlike_stars(minor, size, snr, flags):
 
 
 def _blended(x, y, flux, fwhm):
-    """Mark sources whose core holds more than a few percent of a neighbor's light."""
+    """Mark sources whose core has too much light of a neighbor."""
     blended = np.zeros(len(x), bool)
     pairs = KDTree(np.column_stack([x, y])).query_pairs(4 * fwhm, output_type="ndarray")
     if len(pairs) == 0:

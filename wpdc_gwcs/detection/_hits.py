@@ -1,4 +1,4 @@
-"""Hits of cosmic rays and hot pixels: sharper than any star of the image can be."""
+"""Cosmic-ray hits and hot pixels, which are sharper than any star of the image."""
 
 import logging
 from dataclasses import replace
@@ -16,18 +16,20 @@ log = logging.getLogger(__name__)
 # Pixels tested, in standard deviations of the background.
 _MIN_PEAK = 6.0
 
-# Peaks that tell the size of the stars, in standard deviations; and how many.
+# Minimum height of the peaks that show the size of the stars, in standard deviations, and their
+# maximum number.
 _BRIGHT = 20.0
 _N_BRIGHT = 500
 
-# The sharpest profile that optics and pixels leave, FWHM in px: what is sharper is no star whatever
-# the size of the stars.  Beyond the broadest, hits are told by the same contrast.
+# FWHM in px of the sharpest profile that optics and pixels can produce: anything sharper is not a
+# star.  Above the broadest FWHM, the contrast for hits does not change.
 _SHARPEST, _BROADEST = 1.0, 2.5
 
-# Share of the expected light beside a peak below which it is a hit: profiles vary over the image.
+# Fraction of the expected light next to a peak below which it is a hit; profiles vary over the
+# image.
 _MARGIN = 0.6
 
-# Standard deviations by which noise may take light from the pixels beside, or add to the peak.
+# Standard deviations of noise that may decrease the neighboring pixels or increase the peak.
 _NOISE = 2.5
 
 # Opposite neighbors in four directions.
@@ -35,27 +37,27 @@ _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
 def mask_hits(background, *, overwrite=False):
-    r"""Mask the pixels that cosmic rays and defects have lit.
+    r"""Mask the pixels that are bright because of cosmic rays or defects.
 
     Parameters
     ----------
     background : Background
         Image without background.
     overwrite : bool, optional
-        Whether the pixels of the image and its mask may be changed, instead of copies.
+        Whether the image and its mask may be changed in place instead of copied.
 
     Returns
     -------
     Background
-        The same with these pixels masked too.
+        The background with these pixels masked and set to 0.
 
     Notes
     -----
-    A pixel is a hit where the mean of two opposite neighbors, in any of four directions, is lower
-    than a star centered on it would make it (as in the photometric pipeline of the SDSS, Lupton et
-    al. 2001, ASP Conf. 238, 269).  The stars' profile is taken for a Gaussian of the FWHM along the
-    minor axis of the image's own bright sources, once those that are sharper than 1 px are left
-    out, and the expected light is lowered by 40 % and by 2.5 standard deviations.
+    A pixel is a hit if the mean of two opposite neighbors, in any of four directions, is lower than
+    a star centered on it would make it (as in the photometric pipeline of the SDSS, Lupton et al.
+    2001, ASP Conf. 238, 269).  The profile of stars is assumed to be a Gaussian.  Its FWHM is that
+    of bright sources of the image along their minor axis, without sources sharper than 1 px, and at
+    most 2.5 px.  The expected light is decreased by 40 % and by 2.5 standard deviations.
 
     Examples
     --------
@@ -80,7 +82,7 @@ def mask_hits(background, *, overwrite=False):
     )
     pairs = 0.5 * (beside + against)
     if background.mask is not None:
-        # If one pixel of a pair is bad, the other says nothing: the star may be on the bad side.
+        # If one pixel of a pair is bad, the pair is not used: the star may be on the bad side.
         for sign in (1, -1):
             for pair, (j, i) in zip(pairs, _DIRECTIONS, strict=True):
                 pair[background.mask[y + sign * j, x + sign * i]] = np.inf
@@ -109,7 +111,7 @@ def _peaks(image, rms):
     """Rows and columns of the pixels tested; at the rim, neighbors are missing."""
     rows, columns = [], []
     for first, high in high_pixels(image[1:-1], rms[1:-1], _MIN_PEAK):
-        # Few of many, which are found several times as fast in one row.
+        # There are few of them, which are found several times as fast in a flat array.
         high[:, 0] = high[:, -1] = False
         y, x = np.divmod(np.flatnonzero(high), high.shape[1])
         rows.append(y + first + 1)

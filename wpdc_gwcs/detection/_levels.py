@@ -1,4 +1,4 @@
-"""The level of the sky and its scatter: in the cells of an image, and as smooth maps."""
+"""The level of the sky and its scatter, in the cells of an image and as smooth maps."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -13,21 +13,21 @@ from wpdc_gwcs.threads import map_threads
 
 __all__ = ["Levels", "measure_levels"]
 
-# Share of the pixels of a cell that must count, relative to that of the best cell, for the cell to
-# have a level of its own.
+# Minimum fraction of usable pixels, relative to that of the best cell, for a cell to have its own
+# level.
 _MIN_SHARE = 0.5
 
-# Scatter relative to the typical one, and difference from the level in units of it, below which the
-# pixels of a cell are equal.
+# Scatter of a cell, and difference from its level, in units of the typical scatter, below which its
+# pixels are equal.
 _EQUAL = 0.01
 
 # Constants this many standard deviations above the sky may be those of a saturated star.
 _HIGH = 5.0
 
-# Different constants of padding and dead regions that are looked for.
+# Maximum number of different constants of padding and dead regions.
 _MAX_CONSTANTS = 4
 
-# Rows of cells, and of pixels, that are worked on at a time.
+# Number of rows of cells, and of pixels, that are processed at a time.
 _CELL_ROWS = 8
 _PIXEL_ROWS = 256
 
@@ -39,7 +39,7 @@ class Levels:
     Parameters
     ----------
     rows, columns : (M + 1,), (N + 1,) ndarray of int
-        First rows and columns of the cells, and those behind the last ones.
+        First rows and columns of the cells, followed by the row and column after the last cell.
     level : (M, N) ndarray
         Level of the sky.
     scatter : (M, N) ndarray
@@ -52,7 +52,7 @@ class Levels:
     scatter: np.ndarray
 
     def subtract(self, image):
-        """Take the level of the sky off an image: bicubic splines of those of the cells.
+        """Subtract the level of the sky, interpolated by bicubic splines, from an image.
 
         Parameters
         ----------
@@ -63,7 +63,7 @@ class Levels:
         _put(spline, self.rows, self.columns, self.level, image, beyond=True, subtract=True)
 
     def noise(self):
-        """Map the standard deviation of the sky: monotone cubics, which no step makes swing.
+        """Map the standard deviation of the sky, interpolated by monotone cubics without overshoot.
 
         Returns
         -------
@@ -71,7 +71,7 @@ class Levels:
             Standard deviation in each pixel.
         """
         rms = np.empty((self.rows[-1], self.columns[-1]), np.float32)
-        # Beyond the outermost middles they would swing: the scatter is taken as constant there.
+        # The scatter is constant beyond the outermost centers, where cubics would overshoot.
         kind = PchipInterpolator
         _put(kind, self.rows, self.columns, self.scatter, rms, beyond=False, subtract=False)
         return rms
@@ -85,36 +85,36 @@ def measure_levels(image, mask, mesh, filter_size, scale):
     image : (ny, nx) float32 ndarray
         The image, C-contiguous.
     mask : (ny, nx) bool ndarray or None
-        True for pixels that do not count.
+        True for pixels that are not used.
     mesh : int
-        Size of the cells in px, about: cells of equal sizes fill the image.
+        Approximate size of the cells in px; cells of equal size fill the image.
     filter_size : int
         Size in cells of the median filter over the cells.
     scale : float
-        Scatter of the image, for cells most of whose pixels are equal.
+        Scatter of the image, which is used for cells in which most pixels are equal.
 
     Returns
     -------
-    Levels
+    levels : Levels
         The levels.
     mask : (ny, nx) bool ndarray or None
-        True for pixels that did not count: those given, and those of padding and dead regions,
-        which are equal to most others of their cells.
+        True for pixels that were not used: the given ones, and those of padding and dead regions,
+        which are equal to most other pixels of their cells.
 
     Notes
     -----
-    In every cell the pixels are clipped about their median until none is further away than three
-    standard deviations; the level is the mode, estimated by 2.5 times the median less 1.5 times the
-    mean, or the median where the two differ by more than 0.3 standard deviations (Bertin & Arnouts
-    1996, A&AS 117, 393).  The standard deviation is that after the clipping: of normal noise it
-    lacks 1.6 %, of a sky with faint stars it has their light in it.
+    The pixels of each cell are clipped about their median until none is farther away than three
+    standard deviations.  The level is the mode, estimated as 2.5 times the median minus 1.5 times
+    the mean, or the median if the two differ by more than 0.3 standard deviations (Bertin & Arnouts
+    1996, A&AS 117, 393).  The standard deviation is that after clipping.  For normal noise it is
+    1.6 % too low, and for a sky with faint stars it includes their light.
     """
     rows, columns = (_edges(size, mesh) for size in image.shape)
     for _ in range(_MAX_CONSTANTS):
         level, scatter, constant = _measure(image, mask, rows, columns, scale)
         if not np.isfinite(constant).any():
             break
-        # Cells with less of the same may have a sky.
+        # Cells with fewer pixels of this constant may also have sky.
         tolerance = _EQUAL * np.median(scatter)
         equal = _equal_pixels(image, rows, columns, constant, tolerance)
         mask = equal if mask is None else mask | equal
@@ -123,9 +123,10 @@ def measure_levels(image, mask, mesh, filter_size, scale):
 
 
 def _measure(image, mask, rows, columns, scale):
-    """Level and scatter of cells, those of the nearest where they have none, and constants.
+    """Level and scatter of cells, and constants.
 
-    The latter are the values of cells most of whose pixels are equal; NaN for others.
+    Cells without their own level and scatter get those of the nearest cell.  Constants are the
+    values of cells in which most pixels are equal; NaN for other cells.
     """
     shape = (len(rows) - 1, len(columns) - 1)
 
@@ -136,7 +137,7 @@ def _measure(image, mask, rows, columns, scale):
     level, scatter, number, mean, deviation = (
         np.concatenate(p).reshape(shape) for p in zip(*parts, strict=True)
     )
-    # Most pixels equal, and so in most cells: photons are few.  In single cells it is padding.
+    # If most pixels are equal in most cells, there are few photons; in single cells, it is padding.
     few = (scatter == 0) & (deviation > 0)
     if few.mean() > 0.5:
         level, scatter = np.where(few, mean, level), np.where(few, deviation, scatter)
@@ -149,14 +150,14 @@ def _measure(image, mask, rows, columns, scale):
     if unknown.any():
         nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
         level, scatter = level[tuple(nearest)], scatter[tuple(nearest)]
-    # The middle of a saturated star is no padding, which is larger.
+    # Padding is larger than the center of a saturated star.
     high = constant > level + _HIGH * scatter
     constant[high & ~binary_opening(high, np.ones((2, 2)))] = np.nan
     return level, scatter, constant
 
 
 def _equal_pixels(image, rows, columns, constant, tolerance):
-    """Pixels that have the constant of their cell, or of the nearest next to it that has one."""
+    """Mark the pixels with the constant of their cell, or of the nearest adjacent cell."""
     distance, nearest = distance_transform_edt(np.isnan(constant), return_indices=True)
     constant = np.where(distance < 2, constant[tuple(nearest)], np.nan).astype(np.float32)
     equal = np.zeros(image.shape, bool)
@@ -167,7 +168,7 @@ def _equal_pixels(image, rows, columns, constant, tolerance):
 
 
 def _filtered(values, size):
-    """Values in cells after a median filter, which leaves a slope as it is, at the edges too."""
+    """Values in cells after a median filter, which preserves slopes, even at the edges."""
     margin = [(min(size // 2, n - 1),) * 2 for n in values.shape]
     padded = np.pad(values, margin, mode="reflect", reflect_type="odd")
     inner = tuple(
@@ -177,20 +178,20 @@ def _filtered(values, size):
 
 
 def _edges(size, mesh):
-    """First pixels of cells of nearly equal sizes, and the one behind the last."""
+    """First pixels of cells of nearly equal sizes, and the pixel after the last cell."""
     n_cells = max(1, round(size / mesh))
     return np.arange(n_cells + 1) * size // n_cells
 
 
 def _put(kind, rows, columns, values, image, *, beyond, subtract):
-    """Interpolate values in cells along both axes; write them into an image or take them off it."""
+    """Interpolate values in cells along both axes; write them into an image or subtract them."""
     y, x = _middles(rows), _middles(columns)
     place_y, place_x = (
         np.arange(n) if beyond else np.clip(np.arange(n), *np.clip(v[[0, -1]], 0, n - 1))
         for n, v in zip(image.shape, (y, x), strict=True)
     )
     along_y = kind(y, _repeated(values, len(y)))
-    # Every piece reaches from the middle of a cell to the next, the outer ones to the edges.
+    # Each piece reaches from the center of a cell to the next center; the outer ones to the edges.
     starts = np.ceil(x[:-1])
     starts[0] = 0
     edges = np.append(starts, columns[-1]).astype(float)
@@ -207,11 +208,11 @@ def _put(kind, rows, columns, values, image, *, beyond, subtract):
 
 
 def _middles(edges):
-    """Middles of cells, at least two: one behind the last where there is one cell."""
+    """Centers of cells, at least two: for a single cell, another one after it."""
     middles = (edges[1:] + edges[:-1] - 1) / 2
     return middles if len(middles) > 1 else np.append(middles, edges[-1] + 1.0)
 
 
 def _repeated(values, number):
-    """Values for so many places: as they are, or one for all."""
+    """Values for a given number of places: unchanged, or one value repeated."""
     return np.broadcast_to(values, (number, *values.shape[1:]))

@@ -1,8 +1,8 @@
 """Raw mosaics of color cameras: pixels behind red, green and blue filters in turn.
 
-The pattern repeats every 2 x 2 px.  Its four planes differ in the level and the noise of the sky
-and in their response to stars; brought to one response, with the noise that each then has, they
-are one image of the light of all colors.
+The pattern repeats every 2 x 2 px.  Its four planes differ in the level and noise of the sky and in
+their response to stars.  Scaled to the same response, with the noise scaled accordingly, they are
+one image of the light of all colors.
 """
 
 import numpy as np
@@ -12,34 +12,34 @@ from wpdc_gwcs.robust import robust_scatter
 
 __all__ = ["has_pattern", "plane_slices", "star_responses"]
 
-# Difference between the levels of the planes, in standard deviations of a pixel and of the levels
-# themselves, from which they have backgrounds of their own.
+# Minimum difference between the levels of the planes, in standard deviations of a pixel and of the
+# levels themselves, for separate backgrounds.
 _MIN_DIFFERENCE = 0.1
 _MIN_SIGNIFICANCE = 8.0
 
-# Peaks in the sum of the planes that tell the response: significant, and below saturation.
+# Peaks in the sum of the planes that show the response: significant, and below saturation.
 _MIN_PEAK = 30.0
 _MAX_PEAK = 0.5
 _MIN_PEAKS = 8
 _MAX_PEAKS = 500
 _HALF = 2  # cells of 2 x 2 px about a peak
 
-# Differences of the response below this are those of the stars' samples.
+# Smaller differences of the response are due to the sample of stars.
 _MIN_RESPONSE = 0.02
 
 
 def plane_slices(period):
-    """Slices of the planes of a mosaic.
+    """Return the slices of the planes of a mosaic.
 
     Parameters
     ----------
     period : int
-        Pixels after which the pattern repeats; 1 for an image without one.
+        Number of pixels after which the pattern repeats; 1 for an image without a pattern.
 
     Returns
     -------
     list of (slice, slice)
-        Rows and columns of every plane.
+        Rows and columns of each plane.
     """
     return [
         (slice(j, None, period), slice(i, None, period))
@@ -56,7 +56,7 @@ def has_pattern(data, bad, scatter):
     data : (ny, nx) ndarray
         Image.
     bad : (ny, nx) ndarray of bool or None
-        Pixels that do not count.
+        True for pixels that are not used.
     scatter : float
         Scatter of the pixels about their level.
 
@@ -77,7 +77,7 @@ def has_pattern(data, bad, scatter):
             levels.append(np.median(sample))
             spread = robust_scatter(sample)
             errors.append(1.25 * max(spread, 1e-3 * scatter) / np.sqrt(sample.size))
-    # The noise of a plane, not of the image, whose scatter has the pattern in it.
+    # The noise of a plane, because the scatter of the image includes the pattern.
     noise = np.median(errors) * np.sqrt(sample.size)
     difference = np.max(levels) - np.min(levels)
     return bool(
@@ -93,12 +93,12 @@ def star_responses(image, rms, bad):
     image, rms : (ny, nx) ndarray
         Image without background, and its noise.
     bad : (ny, nx) ndarray of bool or None
-        Pixels that do not count.
+        True for pixels that are not used.
 
     Returns
     -------
     (4,) ndarray
-        Responses relative to their mean; ones where the stars do not tell them apart.
+        Responses relative to their mean; all one if the stars show no differences.
     """
     ny, nx = (n // 2 for n in image.shape)
     planes = np.stack([image[s][:ny, :nx] for s in plane_slices(2)])

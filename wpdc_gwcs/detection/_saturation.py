@@ -14,19 +14,19 @@ _ABOVE_SKY = 10.0
 
 
 def saturation_problem(background, saturation):
-    """Tell why a stated saturation level cannot be that of the pixels.
+    """Explain why a stated saturation level contradicts the pixels of an image.
 
     Parameters
     ----------
     background : Background
         Image without background.
     saturation : float
-        Counts, background included.
+        Saturation level in counts, including the background.
 
     Returns
     -------
     str or None
-        The contradiction, None where there is none.
+        The contradiction; None if there is none.
 
     Examples
     --------
@@ -53,7 +53,7 @@ def saturation_problem(background, saturation):
 
 
 def plateau(background):
-    """Level at which the brightest pixels are cut off.
+    """Find the level at which the brightest pixels are cut off.
 
     Parameters
     ----------
@@ -63,17 +63,17 @@ def plateau(background):
     Returns
     -------
     float or None
-        Counts, background included; None where there is no such level.
+        Level in counts, including the background; None if there is no such level.
 
     Notes
     -----
-    Peaks of stars are the rarer the brighter they are: pixels crowded at the very top have been cut
-    off there.
+    The brighter peaks of stars are, the rarer they are.  So if many pixels have nearly the largest
+    value, they have been cut off there.
     """
     indices, values = background.bright.indices, background.bright.values
     height = background.image.reshape(-1)[indices]
     top = float(height.max(initial=0.0))
-    # Extremes of the image without background, which varies far less than stars' peaks.
+    # The largest values of the image without background: the background varies less than the peaks.
     high = height > 0.9 * top
     if background.mask is not None:
         high &= ~background.mask.reshape(-1)[indices]

@@ -1,4 +1,4 @@
-"""Shapes of sources: sizes under a window, DAOFIND's roundness and sharpness, errors, flags."""
+"""Shapes of sources: windowed sizes, DAOFIND's roundness and sharpness, errors, flags."""
 
 import numpy as np
 
@@ -18,25 +18,25 @@ SIGMA_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 
 
 def window(x, y, xc, yc, half, sigma):
-    """Offsets of pixels from sources, and a Gaussian window about them.
+    """Compute the offsets of pixels from sources, and a Gaussian window.
 
     Parameters
     ----------
     x, y : (N,) ndarray
-        Positions.
+        Positions of the sources, px.
     xc, yc : (N,) ndarray of int
         Central pixels of the cut-outs.
     half : int
         The cut-outs are 2 half + 1 px wide.
     sigma : float
-        Width of the window, px.
+        Standard deviation of the window, px.
 
     Returns
     -------
     dx, dy : (N, n) ndarray
-        Offsets.
+        Offsets, px, with n = 2 half + 1.
     weight : (N, n, n) ndarray
-        Window.
+        Values of the window.
     """
     step = np.arange(-half, half + 1)
     dx = (xc - x)[:, None] + step
@@ -46,7 +46,7 @@ def window(x, y, xc, yc, half, sigma):
 
 
 def sizes(pixels, dx, dy, weight, sigma):
-    """Measure standard deviations along both axes, as for Gaussians under the window.
+    """Measure the standard deviations of sources, as if they were Gaussians, under a window.
 
     Parameters
     ----------
@@ -55,12 +55,13 @@ def sizes(pixels, dx, dy, weight, sigma):
     dx, dy, weight : ndarray
         As from `window`.
     sigma : float
-        Width of the window, px.
+        Standard deviation of the window, px.
 
     Returns
     -------
     (2, N) ndarray
-        Major and minor, px; infinite where broader than the window, NaN without light.
+        Standard deviations along the major and the minor axis, px; infinite for sources that are
+        broader than the window, NaN for those without light.
     """
     weighted = pixels * weight
     total = weighted.sum((1, 2))
@@ -79,27 +80,27 @@ def sizes(pixels, dx, dy, weight, sigma):
 
 
 def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, full):
-    """Measure errors, S/N, shape and per-pixel flags of some sources.
+    """Measure the errors, S/N, shapes and flags of sources from their pixels.
 
     Parameters
     ----------
     background : Background
         Image without background.
     x, y : (N,) ndarray
-        Positions.
+        Positions, px.
     xpeak, ypeak : (N,) ndarray of int
         Brightest pixels.
     fwhm : float
         FWHM of the stars, px.
     gain : float or None
-        Electrons per unit of the background.
+        Electrons per unit of the image.
     full : (ny, nx) ndarray of bool or None
-        True for the pixels that are saturated.
+        True for saturated pixels.
 
     Returns
     -------
     dict
-        Columns; ``peak`` in units of the background.
+        Columns by name; ``peak`` is in units of the image.
     """
     image, bad = background.image, background.mask
     ny, nx = image.shape
@@ -140,7 +141,7 @@ def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, full):
         y_err = 2 * np.sqrt((noise.sum(2) * dy**2).sum(1)) / signal
     positive = signal > 0
     major, minor = sizes(pixels, dx, dy, weight, sigma)
-    # About the centroid where there is light all around it: rings have no peak in the middle.
+    # At the centroid, unless it is far from the peak: rings have no peak in the center.
     central = np.hypot(xc - xpeak, yc - ypeak) <= fwhm
     roundness, sharpness = daofind_shape(
         image, np.where(central, xc, xpeak), np.where(central, yc, ypeak), sigma
@@ -159,21 +160,21 @@ def measure_shapes(background, x, y, xpeak, ypeak, fwhm, gain, full):
 
 
 def daofind_shape(image, xpeak, ypeak, sigma):
-    """DAOFIND's GROUND roundness and sharpness about the given peak pixels.
+    """Compute DAOFIND's GROUND roundness and sharpness at peak pixels.
 
     Parameters
     ----------
     image : (ny, nx) ndarray
-        Image.
+        Image without background.
     xpeak, ypeak : (N,) ndarray of int
-        Peaks.
+        Peak pixels.
     sigma : float
-        Width of the stars, px.
+        Standard deviation of the stars, px.
 
     Returns
     -------
     roundness, sharpness : (N,) ndarray
-        Roundness is NaN where a marginal has no height.
+        Roundness is NaN if a marginal distribution has no height.
     """
     half = max(2, int(1.5 * sigma))
     pixels = cut_squares(image, xpeak, ypeak, half).astype(float)
@@ -203,22 +204,23 @@ def daofind_shape(image, xpeak, ypeak, sigma):
 
 
 def mode(values):
-    """Most crowded value and its scatter: center and width of the shortest third of the values.
+    """Return the most frequent value and the scatter about it.
 
     Parameters
     ----------
     values : (N,) array_like
-        At least one.
+        At least one value.
 
     Returns
     -------
     value, scatter : float
-        The scatter is zero for a handful of values.
+        Median of the shortest third of the sorted values, and their scatter as a standard
+        deviation, which is 0 for one or two values.
 
     Notes
     -----
-    Cosmic rays and galaxies can be more than half of the bright sources; the stars are those that
-    are alike.
+    More than half of the bright sources may be cosmic rays and galaxies, but only stars are similar
+    to each other.
     """
     values = np.sort(values)
     n = max(2, int(np.ceil(len(values) / 3)))

@@ -1,13 +1,13 @@
-"""Work on whole images strip by strip, always in the same memory.
+"""Processing of whole images strip by strip, always in the same memory.
 
-Memory that is had from the system anew for every strip costs more time than the work in it.
+To get new memory from the system for every strip takes more time than the work itself.
 """
 
 import numpy as np
 
 __all__ = ["high_pixels", "row_strips"]
 
-# Pixels of a strip: few enough for the cache of a processor.
+# Number of pixels in a strip, which fits into the cache of a processor.
 _PIXELS = 200_000
 
 
@@ -22,14 +22,14 @@ def row_strips(shape):
     Returns
     -------
     list of slice
-        Their rows; the first has as many as any.
+        Rows of the strips; no strip has more rows than the first one.
     """
     step = max(1, _PIXELS // shape[1])
     return [slice(k, min(k + step, shape[0])) for k in range(0, shape[0], step)]
 
 
 def high_pixels(image, rms, factor):
-    """Mark the pixels of an image that are so many standard deviations high.
+    """Mark the pixels of an image above a number of standard deviations.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def high_pixels(image, rms, factor):
     first : int
         First row of a strip.
     high : (n, nx) ndarray of bool
-        True for the pixels that are; good until the next strip.
+        True for these pixels; the array is reused for the next strip.
     """
     strips = row_strips(image.shape)
     limit = np.empty((strips[0].stop, image.shape[1]), np.float32)

@@ -8,11 +8,11 @@ from wpdc_gwcs.threads import map_threads
 
 __all__ = ["CELL", "find_windows", "high_cells"]
 
-# Side of a cell in px, and rows of cells that are looked at at a time.
+# Side of a cell in px, and number of rows of cells that are processed at a time.
 CELL = 32
 _CELL_ROWS = 8
 
-# Rounding of float32 in a filter: what is so near the threshold counts as higher.
+# Rounding error of float32 in a filter: values so close to the threshold count as above it.
 _ROUNDING = 1e-4
 
 _TOUCHING = np.ones((3, 3), bool)
@@ -26,16 +26,16 @@ def high_cells(image, rms, mask, line, factor):
     image, rms : (ny, nx) float32 ndarray
         Image, and its noise, C-contiguous.
     mask : (ny, nx) bool ndarray or None
-        True for pixels that count as 0, as those beyond the image do.
+        True for pixels that count as 0, like those outside the image.
     line : (2 n + 1,) ndarray
-        Weights of the filter along each axis, the same from both ends.
+        Symmetric weights of the filter along each axis.
     factor : float
         The threshold, in standard deviations of the noise of single pixels.
 
     Returns
     -------
     (my, mx) ndarray of bool
-        Cells of 32 x 32 px.
+        True for marked cells of 32 x 32 px.
     """
     line, factor = np.asarray(line, np.float32), (1 - _ROUNDING) * factor
     n, m = (-(-size // CELL) for size in image.shape)
@@ -50,24 +50,24 @@ def high_cells(image, rms, mask, line, factor):
 
 
 def find_windows(cells, shape, margin):
-    """Find windows that hold the cells marked, those that touch each other in the same window.
+    """Find windows around marked cells; cells that touch each other share a window.
 
     Parameters
     ----------
     cells : (my, mx) ndarray of bool
-        Cells, as from `high_cells`.
+        Marked cells, as from `high_cells`.
     shape : (int, int)
         Shape of the image.
     margin : int
-        Pixels of the windows around their cells.
+        Margin of the windows around their cells, px.
 
     Returns
     -------
     list of (slice, slice)
         Rows and columns of each window.
     labels : (my, mx) ndarray of int
-        Number of the window of each cell, from 1; 0 for cells not marked.  Windows overlap where
-        their cells mesh.
+        Number of the window of each cell, from 1; 0 for unmarked cells.  Windows of interlocking
+        groups of cells overlap.
     """
     labels, _ = ndimage.label(cells, _TOUCHING)
 
