@@ -1,6 +1,6 @@
 """Rows of a list that are the same star, from stacked lists or overlapping cones.
 
-A star that occurs twice in a list is two candidates for its partner, and cannot be matched.
+A star that occurs twice in a list is ambiguous for its partner, so it cannot be matched.
 """
 
 import numpy as np
@@ -10,22 +10,22 @@ from scipy.spatial import cKDTree
 
 __all__ = ["group_copies"]
 
-# Two positions of one star differ by less than this many of their errors in 0.99999 of all cases.
+# Two positions of a star differ by less than this many of their errors in 0.99999 of all cases.
 _N_SIGMA = 5.0
-# Largest distance of two copies, in units of the distance between stars: chance puts another star
-# as close as that to 3 of 100.
+# Largest distance of two copies, in units of the distance to the sixth neighbor, which is a tenth
+# of the distance between stars.  By chance, 3 of 100 stars have another star as close as this.
 _REACH = 0.07
-# Copies beyond the errors are believed in where there are so many that chance and double stars
-# cannot be it: 1 to 2 of 100 stars are double within an arcsecond, few with two of one brightness.
+# Pairs beyond their errors are copies only if there are too many for chance and double stars: 1 to
+# 2 of 100 stars are double within an arcsecond, and few of these have the same brightness.
 _LEAST_COPIES, _LEAST_SHARE, _LEAST_SHARE_ALIKE = 10, 0.05, 0.02
-# Greatest distance of two copies, in units of the median distance.
+# Largest distance of two copies, in units of the median distance.
 _SPREAD = 4.0
-# Differences of brightness, magnitudes: of one star in two bands, and of one star measured again.
+# Differences in magnitude: of a star in two bands, and of a star that is measured again.
 _MOST_APART, _ALIKE = 1.0, 0.1
 # Number of neighbors examined per row, and neighbor whose distance gives the spacing of stars.
 _NEAR, _DISTANT = 6, 6
-# By chance, as many pairs are between a radius and 1.4 times as much as within it, along a line 0.4
-# of them: copies are closer together than that.
+# By chance, there are as many pairs between a radius and 1.4 times the radius as within it (for
+# stars on a line, 0.4 of them).  Copies are closer to each other than that.
 _ANNULUS, _CROWDING = 2**0.5, 3.5
 
 
@@ -52,10 +52,15 @@ def group_copies(points, *, reach, errors=None, mag=None, links=None):
 
     Notes
     -----
-    One star are rows at exactly the same place, rows closer than five times their errors whose
-    magnitudes differ by less than one, and, where such pairs are far more than chance and double
-    stars could be, all pairs closer than a tenth of the distance between stars (and than `reach`)
-    that are equally bright to 0.1 mag, but for those four times as far apart as most of them.
+    Rows at exactly the same position are the same star, and so are the pairs in ``links``.  Other
+    pairs have to be closer than ``reach`` and than about a tenth of the distance between stars.
+    They are the same star in two cases:
+
+    1. Their distance is less than five times their errors, and their magnitudes, if known, differ
+       by at most one.
+    2. Their magnitudes, if known, agree to 0.1 mag, and there are far more such pairs than chance
+       and double stars can explain.  Pairs with more than four times the median distance are not
+       included.
     """
     n = len(points)
     i, j = (np.empty(0, int), np.empty(0, int)) if links is None else links
@@ -65,7 +70,7 @@ def group_copies(points, *, reach, errors=None, mag=None, links=None):
     first[place_of[::-1]] = np.arange(n - 1, -1, -1)
     edges = [(i, j), (np.arange(n), first[place_of])]
     if len(places) > 1:
-        # rows at the same position are represented by the first one
+        # The first row at each position represents the others.
         some = None if errors is None else np.asarray(errors, float)[first]
         brightness = None if mag is None else np.asarray(mag, float)[first]
         near = _near_pairs(places, reach, some, brightness)
@@ -80,7 +85,8 @@ def _near_pairs(points, reach, errors, mag):
     n = len(points)
     tree = cKDTree(points)
     distant = tree.query(points, k=[min(_DISTANT, n - 1) + 1])[0][:, 0]
-    # the sixth neighbor is 1.4 times as far as stars are apart; with two copies of each, as far
+    # The distance of the sixth neighbor is 1.4 times that between stars; with two copies of each
+    # star, it is about the same.
     limit = np.minimum(_REACH * distant, reach)
     distance, other = tree.query(
         points, k=min(_NEAR, n), distance_upper_bound=float(limit.max()) * _ANNULUS * (1 + 1e-12)
@@ -101,7 +107,7 @@ def _near_pairs(points, reach, errors, mag):
         one |= (distance <= _N_SIGMA * sigma) & ~(known & (apart > _MOST_APART))
     least = n * (_LEAST_SHARE_ALIKE if known.sum() > 0.5 * len(rows) else _LEAST_SHARE)
     if n_alike > max(_LEAST_COPIES, least, _CROWDING * n_around):
-        # most of them are copies: their distances say how far apart copies are
+        # Most of them are copies, so their distances show how far apart copies are.
         typical = np.median(distance[alike & (share <= 1.0)])
         one |= alike & (distance <= _SPREAD * typical)
     one &= share <= 1.0
