@@ -120,9 +120,8 @@ def write_stock(obj, path, *, overwrite=False):
 
     Returns
     -------
-    deviation : float
-        Its largest deviation from the exact WCS, px; `None` if the shape of the detector is
-        unknown.
+    deviation : float or None
+        Largest deviation from the exact WCS, px; `None` if the shape of the detector is unknown.
     """
     from wpdc_gwcs.export import deviation
     from wpdc_gwcs.wcs import to_stock_wcs

@@ -312,5 +312,5 @@ def _as_float(data, blank, scale, zero):
         return image
     if data.dtype.itemsize == 8 or data.dtype.itemsize == 2 or not data.flags.writeable:
         return data.astype(np.float64 if data.dtype.itemsize == 8 else np.float32)
-    # In the memory of what was read: that of another image takes longer to be had than the swap.
+    # In place, because new memory for another image takes longer than the byte swap.
     return data if data.dtype.isnative else data.byteswap(inplace=True).view(np.float32)

@@ -1,7 +1,7 @@
-"""Whether a file is what was written: version, size of what it asks for, and sum of its content.
+"""Checks that a file is intact: its version, the size of its content, and its checksum.
 
-A file that says too much is as bad as a damaged one: a few lines of YAML aliases stand for more
-values than there is memory, and a few bytes of a compressed block for more than there is disk.
+A file can also do harm by its size: a few lines of YAML aliases may expand to more values than fit
+into memory, and a small compressed block to more than fits on disk.
 """
 
 import hashlib
@@ -25,10 +25,10 @@ __all__ = [
     "parse_version",
 ]
 
-# A solution of 100,000 frames names each of them; all else is small.
+# A solution of 100,000 frames has the names of all of them; everything else is small.
 _MOST_NODES = 1_000_000
 _DEEPEST = 100
-# The largest of our files, a solution with its residual map, has 40 MB.
+# The largest of our files, a solution with its residual map, is 40 MB.
 _MOST_BYTES = 4 << 30
 _BLOCK = struct.Struct(">I4sQQQ16s")
 _BLOCK_MAGIC = b"\xd3BLK"
@@ -36,17 +36,17 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def parse_version(text):
-    """Read a version.
+    """Parse a format version.
 
     Parameters
     ----------
     text : str
-        Such as ``1.2.0`` or ``1.0``.
+        Version such as ``1.2.0`` or ``1.0``.
 
     Returns
     -------
     tuple of int or None
-        `None` if it is no version.
+        Numbers of the version; `None` if the text is not a version.
     """
     parts = str(text).split(".")
     if 2 <= len(parts) <= 3 and all(part.isdecimal() and part.isascii() for part in parts):
@@ -55,7 +55,7 @@ def parse_version(text):
 
 
 def check_version(text, path):
-    """Refuse what only a later package can understand.
+    """Raise an error for a format version that only a later package can read.
 
     Parameters
     ----------
@@ -67,12 +67,13 @@ def check_version(text, path):
     Returns
     -------
     tuple of int
-        The version.  A later minor version adds what need not be known, and is let pass.
+        Numbers of the version.  A later minor version is accepted, because it only adds optional
+        content.
 
     Raises
     ------
     FileFormatError
-        If it is no version, or a later major one.
+        If the text is not a version, or is a later major version.
     """
     version = parse_version(text)
     if version is None:
@@ -86,7 +87,7 @@ def check_version(text, path):
 
 
 def check_sums(hdus, path):
-    """Refuse FITS files of this package whose content does not agree with CHECKSUM and DATASUM.
+    """Raise an error for a FITS file of this package that contradicts its CHECKSUM or DATASUM.
 
     Parameters
     ----------
@@ -98,12 +99,12 @@ def check_sums(hdus, path):
     Raises
     ------
     FileFormatError
-        If the sums of an HDU are there and wrong.  Headers of this package that were copied into
-        images of others are not asked: the sums that came with them are those of another HDU.
+        If an HDU has wrong sums.  Headers of this package that were copied into other images are
+        not checked, because their sums are those of another HDU.
     """
     for number, hdu in enumerate(hdus):
         try:
-            # Not 0, which is a wrong sum; 2 is no sum at all.
+            # 0 means a wrong sum, 2 means that there is none.
             agrees = not _is_ours(hdu) or (hdu.verify_checksum() and hdu.verify_datasum())
         except READ_ERRORS as problem:
             raise FileFormatError(f"{path}: damaged FITS file: {first_line(problem)}") from problem
@@ -115,7 +116,7 @@ def check_sums(hdus, path):
 
 
 def _is_ours(hdu):
-    """Tell our tables, and our headers as they were written: alone, or before zeros."""
+    """Recognize our tables, and our headers as they were written: alone, or with zeros."""
     if hdu.name.startswith("WPDC_"):
         return True
     if not is_ours(hdu.header) or not isinstance(hdu, fits.PrimaryHDU):
@@ -124,17 +125,17 @@ def _is_ours(hdu):
 
 
 def content_sum(tree):
-    """Sum of a tree of plain values and arrays.
+    """Compute the checksum of a tree of plain values and arrays.
 
     Parameters
     ----------
     tree : dict
-        What is written, or was read back.
+        Tree to write, or a tree that was read.
 
     Returns
     -------
     str
-        SHA-256 in hexadecimal digits, which depends on names and values only, not on their order or
+        SHA-256 in hexadecimal digits.  It depends on names and values only, not on their order or
         their form in the file.
     """
     digest = hashlib.sha256()
@@ -144,8 +145,8 @@ def content_sum(tree):
 
 def _add(digest, value):
     if isinstance(value, np.ndarray):
-        # To files, numbers of one kind are one kind.
-        # We write no others, and where a file has some, the sum is another one.
+        # Files do not distinguish numbers of the same kind.
+        # This package writes no other types; if a file has some, its sum differs.
         kinds = {"b": "<i8", "i": "<i8", "u": "<u8", "f": "<f8"}
         value = value.astype(kinds.get(value.dtype.kind, value.dtype))
         digest.update(f"array{value.shape}{value.dtype.str}".encode())
@@ -167,20 +168,20 @@ def _add(digest, value):
 
 
 def check_size(stream, path):
-    """Refuse an ASDF file that stands for more than it can need, before anything is built of it.
+    """Raise an error for an ASDF file with excessive content, before anything is built from it.
 
     Parameters
     ----------
     stream : file object
-        The file, open for reading bytes; left at its beginning.
+        The file, open for reading bytes; its position is the beginning afterward.
     path : path-like
         The file, for the message.
 
     Raises
     ------
     FileFormatError
-        If the tree is not YAML, is too large or too deep with its aliases written out, or if the
-        blocks would need too much memory.
+        If the tree is not YAML, if it is too large or too deep with all aliases expanded, or if
+        the blocks need too much memory.
     """
     head = []
     for line in stream:
@@ -190,7 +191,7 @@ def check_size(stream, path):
     _check_tree(b"".join(head), path)
     _check_blocks(stream, path)
     stream.seek(0)
-    # asdf reads from below the buffer of a stream, where a small file has been read to its end.
+    # asdf reads from the raw file under the buffer, which has already read a small file to its end.
     getattr(stream, "raw", stream).seek(0)
 
 
@@ -223,7 +224,7 @@ def _check_tree(text, path):
 
 
 def _check_blocks(stream, path):
-    """Go from block to block and add up what they hold once they are decompressed."""
+    """Go from block to block and add up their decompressed sizes."""
     total = 0
     start = stream.read(1)
     while start == b"\0":
@@ -233,7 +234,7 @@ def _check_blocks(stream, path):
         size = stream.read(2)
         header = stream.read(int.from_bytes(size)) if len(size) == 2 else b""
         if len(header) < _BLOCK.size:
-            return  # cut short, which asdf tells
+            return  # cut short, which asdf reports
         _, _, allocated, _, data, _ = _BLOCK.unpack_from(header)
         total += data
         if total > _MOST_BYTES:

@@ -1,4 +1,4 @@
-"""FITS_LDAC: a header as one long string in a table of its own, and after it a table of objects."""
+"""FITS_LDAC: a table that contains a header as one long string, and a table of objects."""
 
 import numpy as np
 from astropy.io import fits
@@ -16,15 +16,15 @@ def write_ldac(table, header, path):
     table : `~astropy.table.Table`
         The objects.
     header : `~astropy.io.fits.Header`
-        Header of the image that they are of.
+        Header of their image.
     path : path-like
         File to write.
     """
-    # SCAMP takes a header for damaged that does not begin as one of a file.
+    # SCAMP rejects a header that does not begin like that of a file.
     header = fits.Header([*_BEGIN, *header.cards], copy=True) if "SIMPLE" not in header else header
     cards = [str(card).ljust(80).encode("ascii") for card in header.cards]
     cards.append(b"END".ljust(80))
-    # Padded with blanks: readers in C take a NUL for the end of the header.
+    # Padded with blanks, because a NUL would end the header for readers in C.
     text = np.frombuffer(b"".join(cards), np.uint8).reshape(1, len(cards), 80)
     imhead = fits.BinTableHDU.from_columns(
         [fits.Column("Field Header Card", f"{text.size}B", dim=f"(80, {len(cards)})", array=text)],

@@ -1,8 +1,8 @@
-"""Simulations in files: frames and catalog as the command line reads them, and the truth.
+"""Simulations in files: frames and a catalog for the command line, and the truth.
 
 ::
 
-    NAME.ldac | NAME.cat.ecsv + NAME.hdr | NAME.fits     what was measured
+    NAME.ldac | NAME.cat.ecsv + NAME.hdr | NAME.fits     the measurement
     CAMERA-reference.fits                                the reference catalog
     truth.asdf, NAME.truth.ecsv                          the truth: an exact WCS, star by star
 """
@@ -28,7 +28,7 @@ _UNITS = {"x": u.pix, "y": u.pix, "ra": u.deg, "dec": u.deg, "magnitude": u.mag,
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The truth about the frames of a simulation, from its folder.
+    """The truth about the frames of a simulation, read from its folder.
 
     Parameters
     ----------
@@ -37,11 +37,11 @@ class Truth:
     camera : str
         Name of the camera.
     catalog : Path
-        The reference catalog.
+        Path of the reference catalog.
     frames : dict
-        Name of a frame to `~wpdc_gwcs.simulation.FrameTruth`.
+        `~wpdc_gwcs.simulation.FrameTruth` of each frame, by name.
     files : dict
-        Name of a frame to the path that `wpdc calibrate` reads.
+        Path of each frame for ``wpdc calibrate``, by name.
 
     Examples
     --------
@@ -74,9 +74,9 @@ class Truth:
         -------
         `~astropy.table.Table`
             Stars on the detector: ``x``, ``y`` in px, ``ra``, ``dec`` in deg at the epoch of the
-            frame, ``magnitude``, perhaps ``color``, ``catalog_index`` (0-based row of the
-            reference, -1 where it has not the star) and, of source lists, ``source_index``
-            (0-based row of the list, -1 where the star was not detected).
+            frame, ``magnitude``, ``color`` if stars have colors, ``catalog_index`` (zero-based row
+            of the reference, -1 for stars that it does not have) and, for source lists,
+            ``source_index`` (zero-based row of the list, -1 for stars that were not detected).
         """
         return read_table(
             self.folder / f"{name}.truth.ecsv",
@@ -90,12 +90,12 @@ def read_truth(folder):
     Parameters
     ----------
     folder : path-like
-        Folder that `write_simulation` wrote.
+        Folder that was written by `write_simulation`.
 
     Returns
     -------
     Truth
-        The truth; tables of stars are read when they are asked for.
+        The truth; tables of stars are read when they are requested.
 
     Raises
     ------
@@ -130,20 +130,20 @@ def write_simulation(
     progress=None,
     **render_options,
 ):
-    """Write a simulation to files, as `wpdc calibrate` reads them, with the truth about it.
+    """Write a simulation to files for ``wpdc calibrate``, together with the truth about it.
 
     Parameters
     ----------
     simulation : Simulation
         The simulation.
     directory : path-like
-        Folder to write to; made where it is missing.
+        Folder to write to; made if needed.
     images : sequence of int, optional
-        Exposures (counted from 0) that are written as rendered images; the others as source lists.
+        Exposures (counted from 0) to write as rendered images; the others become source lists.
     sources : {"ecsv", "ldac"}, optional
-        Form of the source lists: a table beside a text header, or FITS_LDAC.
+        Form of the source lists: a table and a text header, or FITS_LDAC.
     overwrite : bool, optional
-        Replace files that are already there.
+        Whether existing files may be replaced.
     progress : callable, optional
         Called as ``progress("write", done, total)`` after each frame.
     **render_options
@@ -153,15 +153,16 @@ def write_simulation(
     -------
     dict
         ``"reference"``: path of the catalog; ``"frames"``: list with one path per exposure, image
-        or source list; ``"headers"``: list of paths of the text headers, `None` if the frame has
-        its own; ``"truth"``: path of the exact WCSs, beside tables of the stars of each frame.
+        or source list; ``"headers"``: list of paths of the text headers, `None` for a frame that
+        has its own; ``"truth"``: path of the exact WCSs.  The tables of the stars of each frame
+        are in the same folder.
 
     Raises
     ------
     ValueError
         If the form of the source lists is unknown.
     FileExistsError
-        If a file is there already and ``overwrite`` is not set.
+        If a file exists and ``overwrite`` is not set.
     InputError
         If the folder cannot be written to.
 

@@ -1,12 +1,12 @@
-"""Source lists: columns of any measuring program, brought to ours.
+"""Source lists: conversion of the columns of other programs to those of this package.
 
 ::
 
     table (FITS, ECSV, IRAF, DAOPHOT, ...) --standardize_sources--> x, y from zero, errors, flags
 
-Pixels count from zero here.  A list counts from one if its columns are SExtractor's, or if it says
-so: files of astrometry.net (``AN_FILE``), of IRAF and DAOPHOT, or a word in a header, comment or
-description.
+Here, pixels are counted from zero.  A list is counted from one if its columns are those of
+SExtractor, or if it says so: files of astrometry.net (``AN_FILE``), IRAF and DAOPHOT, or words in a
+header, comment or description.
 """
 
 import logging
@@ -35,8 +35,8 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 
-# Families of position columns, best first: x, y, first pixel.  SExtractor counts from one, and so
-# do the tables of Cambridge (CASU, WFCAM); photutils and the pipelines of Rubin count from zero.
+# Families of position columns, best first: x, y, first pixel.  SExtractor and the tables of
+# Cambridge (CASU, WFCAM) count from one; photutils and the Rubin pipelines count from zero.
 _FAMILIES = (
     ("x", "y", None),
     ("x_centroid", "y_centroid", 0),
@@ -87,7 +87,7 @@ _WANTED = {
 }
 
 
-# Keywords and words that tell where pixels begin.
+# Keywords and words that indicate the first pixel.
 _FROM = (
     r"\b({word}|{digit})[- ]?(based|index)|\borigin\W+(is |at )?\W*{digit}\b"
     r"|\b(pixel|coordinate|position|x, ?y)\w*\b[^.;]{{0,40}}\b(from|at|with) \W*({word}|{digit})\b"
@@ -101,20 +101,20 @@ _FROM_ONE = re.compile(
 _FROM_ZERO = re.compile(
     _FROM.format(word="zero", digit="0") + r"|\bphotutils\b|\bwpdc_gwcs\b", re.IGNORECASE
 )
-# In the header of an image it says nothing of a list that came later.
+# In the header of an image, this says nothing about a list that was made later.
 _IRAF = re.compile(r"\bIRAF\b")
-# Files of astrometry.net, whose X and Y are those of FITS.
+# Files of astrometry.net, whose X and Y are FITS pixels.
 _MARKS_OF_ONE = ("AN_FILE",)
 _ORIGIN_KEYS = ("PIXORIG", "PIX_ORIG", "PIXEL_ORIGIN", "XYORIGIN", "XYORIG", "PIXBASE", "INDEXING")
-# Sources are one if they are no further apart: what is closer is no two sources to anyone.
+# Sources within this distance are one source, because no program separates closer ones.
 _COPY_REACH = 1.0  # px
-# By chance, a few sources in a thousand have a neighbor within their errors; a list with more than
-# this share was stacked from several.
+# By chance, a few sources in a thousand have a neighbor within their errors.  A list with more than
+# this fraction was stacked from several lists.
 _MOST_BY_CHANCE = 0.01
 
 
 def position_columns(names):
-    """Find the columns of positions.
+    """Find the position columns.
 
     Parameters
     ----------
@@ -124,13 +124,13 @@ def position_columns(names):
     Returns
     -------
     (str, str, int or None) or None
-        Names of x and y as they are spelled, and the number of the first pixel, `None` if the
-        names do not tell; `None` if there are no such columns.
+        Names of the columns x and y, and the number of the first pixel, which is `None` if the
+        names do not show it; `None` if there are no such columns.
     """
     spelled = spelled_names(names)
     for x, y, origin in _FAMILIES:
         if x in spelled and y in spelled:
-            # A PSF fit without errors did not converge on much (SExtractor leaves them out then).
+            # SExtractor leaves the errors out if few PSF fits converged.
             if x == "xpsf_image" and "errapsf_image" not in spelled:
                 continue
             return spelled[x], spelled[y], origin
@@ -145,16 +145,16 @@ def source_origin(names, headers=(), texts=()):
     Parameters
     ----------
     names : sequence of str
-        Names of its columns.
+        Names of the columns.
     headers : sequence of `~astropy.io.fits.Header`, optional
-        Its headers.
+        Headers of the list.
     texts : sequence of str, optional
         Comments and descriptions.
 
     Returns
     -------
     int or None
-        0 or 1; `None` if nothing tells.
+        0 or 1; `None` if there is no indication.
     """
     found = position_columns(names)
     if found is not None and found[2] is not None:
@@ -191,7 +191,7 @@ def load_fits_sources(path, index, *, origin=0):
     Returns
     -------
     `~astropy.table.Table`
-        As `standardize_sources` makes it.
+        Table as from `standardize_sources`.
 
     Raises
     ------
@@ -219,19 +219,19 @@ def read_source_table(path):
     Parameters
     ----------
     path : path-like
-        Any table of astropy, or a list of DAOPHOT.
+        File with a table that astropy can read, or a list of DAOPHOT.
 
     Returns
     -------
     table : `~astropy.table.Table`
-        As it is in the file.
+        Table as in the file.
     texts : list of str
-        Comments, keywords and descriptions in it.
+        Comments, keywords and descriptions in the file.
 
     Raises
     ------
     FrameError
-        If it cannot be read or has no positions.
+        If the file cannot be read or has no positions.
     """
     try:
         with warnings.catch_warnings():
@@ -263,10 +263,10 @@ def _text_of(key, value):
 
 
 def _read_daophot(path):
-    """Read a list of Stetson's DAOPHOT: three lines of header, stars in blocks of one line or more.
+    """Read a list of Stetson's DAOPHOT: three header lines, then one or more lines per star.
 
-    The files of FIND, PEAK, NSTAR and ALLSTAR have a line for each star, those of PHOTOMETRY an
-    empty one and two (NL = 2); identifier, x, y and magnitude come first in all.
+    The files of FIND, PEAK, NSTAR and ALLSTAR have one line for each star, those of PHOTOMETRY an
+    empty line and two more (NL = 2).  All begin with identifier, x, y and magnitude.
     """
     lines = read_lines(path)
     kind = int(lines[1].split()[0])
@@ -282,41 +282,40 @@ def _read_daophot(path):
 
 
 def standardize_sources(table, *, name="sources", origin=None):
-    """Bring a source list to the columns of this package.
+    """Convert a source list to the columns of this package.
 
     Parameters
     ----------
     table : mapping
-        Table or dictionary of columns, with this package's, photutils' or SExtractor's names.
+        Table or dictionary of columns, with names of this package, photutils or SExtractor.
     name : str, optional
-        Name of it in messages.
+        Name of the list in messages.
     origin : int, optional
-        Number of the first pixel; by default as the columns' names tell, else 0.
+        Number of the first pixel.  Default: that of the column names, or else 0.
 
     Returns
     -------
     sources : `~astropy.table.Table`
-        ``x``, ``y`` (zero based) and, as far as they are there, ``x_err``, ``y_err``, ``flux``,
-        ``snr``, ``roundness``, ``flags``, ``sharpness``, ``fwhm``, ``peak``, ``mag``; the rows of
-        the input.
+        Columns ``x``, ``y`` (zero based) and, if the list has them, ``x_err``, ``y_err``, ``flux``,
+        ``snr``, ``roundness``, ``flags``, ``sharpness``, ``fwhm``, ``peak`` and ``mag``.  The rows
+        are those of the input.
 
     Raises
     ------
     FrameError
-        If there are no positions or none is a number.
+        If there are no positions, or none of them is a number.
 
     Warns
     -----
     WPDCWarning
-        If rows or columns cannot be read, or rows are copies of others: these have no position
-        (NaN).
+        If rows or columns cannot be read, or rows are copies of others, whose positions become NaN.
 
     Notes
     -----
-    Errors of SExtractor are ellipses (``ERRAWIN_IMAGE``, ...); taken is their extent along x and y.
-    ``ELONGATION`` e becomes a roundness 2 (e - 1) / (e + 1), which is DAOFIND's for a source
-    elongated along an axis.  Of SExtractor's ``FLAGS``, the lowest bit (a neighbor in the
-    aperture) says nothing of the centroid and is dropped.
+    Errors of SExtractor are ellipses (``ERRAWIN_IMAGE``, ...), of which the extent along x and y is
+    used.  ``ELONGATION`` e becomes the roundness 2 (e - 1) / (e + 1), which is that of DAOFIND for
+    a source elongated along an axis.  The lowest bit of SExtractor's ``FLAGS`` (a neighbor in the
+    aperture) is ignored, because it does not concern the centroid.
     """
     names = list(getattr(table, "colnames", table))
     found = position_columns(names)
@@ -345,7 +344,7 @@ def standardize_sources(table, *, name="sources", origin=None):
             None,
         )
     if errors is not None and all(e is not None for e in errors):
-        # An error of zero is SExtractor's word for none.
+        # In SExtractor, an error of zero means that it is unknown.
         out["x_err"], out["y_err"] = (np.where(e > 0, e, np.nan) for e in errors)
     fluxes = _FLUXES if tag == "psf" else tuple(f for f in _FLUXES if f != "flux_psf")
     flux_name = next((f for f in fluxes if f in spelled), None)
@@ -354,7 +353,7 @@ def standardize_sources(table, *, name="sources", origin=None):
     else:
         magnitude = column(*_MAGNITUDES)
         if magnitude is not None:
-            # 99 stands for no magnitude.
+            # 99 means that there is no magnitude.
             faint = np.where(np.abs(magnitude) < 90.0, magnitude, np.nan)
             out["flux"] = 10.0 ** (-0.4 * (faint - 25.0))
     out["snr"] = column("snr", "snr_win")
@@ -406,7 +405,7 @@ def _position(table, label, name):
 
 
 def _copies(sources):
-    """Mark the further rows of sources; tell whether chance cannot explain them."""
+    """Mark repeated rows of sources, and return whether there are too many for chance."""
     again = np.zeros(len(sources), bool)
     rows = np.flatnonzero(np.isfinite(sources["x"]) & np.isfinite(sources["y"]))
     if len(rows) < 2:

@@ -1,4 +1,4 @@
-"""Which cards of a header belong to its WCS, and which extensions they refer to."""
+"""Cards of a header that belong to its WCS, and the extensions that they refer to."""
 
 import re
 
@@ -9,7 +9,7 @@ from wpdc_gwcs.io.headers import header_text, header_value, is_ours
 
 __all__ = ["alternates_of", "is_stale", "tables_of"]
 
-# Keywords of a WCS that may have the letter of an alternate behind them.
+# Keywords of a WCS that may end in the letter of an alternate.
 _ANY = (
     r"WCSAXES|WCSNAME|LONPOLE|LATPOLE|RADESYS|EQUINOX|"
     r"(?:CTYPE|CUNIT|CRVAL|CRPIX|CDELT|CROTA|CNAME|CRDER|CSYER)\d+|"
@@ -26,26 +26,26 @@ _PRIMARY = re.compile(
     # Plate solutions of the Digitized Sky Survey and of SuperCOSMOS; TNX and ZPX of IRAF.
     r"AMD[XY]\d+|PPO\d+|CO[12]_\d+|PLTRA[HMS]|PLTDEC(?:SN|[DMS])|PLTSCALE|CNPIX[12]|[XY]PIXELSZ|"
     r"WAT\d_\d+|WCSDIM|"
-    # What this package writes.
+    # Keywords of this package.
     r"WPDC(?:VERS|TAB|DEV)"
 )
 _HISTORY = "WCS by wpdc_gwcs"
 
 
 def is_stale(card, alternates):
-    """Return whether a card goes when another primary WCS comes.
+    """Return whether a card must be removed when the primary WCS is replaced.
 
     Parameters
     ----------
     card : str
         The card, 80 characters.
     alternates : collection of str
-        Letters of the alternates that go, too.
+        Letters of alternate WCSs that are removed, too.
 
     Returns
     -------
     stale : bool
-        Whether it does.
+        True for a card of the old WCS.
     """
     keyword = card[:8].rstrip()
     if keyword == "HISTORY":
@@ -69,7 +69,7 @@ def alternates_of(header):
     Returns
     -------
     letters, with_sip : set of str
-        All of them; those that mean nothing without the SIP terms of the primary WCS.
+        Letters of all alternates, and of those that need the SIP terms of the primary WCS.
     """
     letters = {m[1] for key in header if (m := _ALTERNATE.fullmatch(key)) is not None}
     with_sip = {
@@ -103,7 +103,7 @@ def tables_of(header):
             if header_text(header, f"{kind}{axis}").lower() == "lookup":
                 found.add((name, _version(header, f"{record}{axis}.EXTVER")))
         name = header_text(header, f"PS{axis}_0").upper()
-        # Without a name it refers to nothing, and not to all that have none.
+        # Without a name, it refers to no extension, not to all those without a name.
         if header_text(header, f"CTYPE{axis}").endswith("-TAB") and name:
             found.add((name, _version(header, f"PV{axis}_1")))
     if is_ours(header):

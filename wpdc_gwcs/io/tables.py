@@ -16,7 +16,7 @@ from wpdc_gwcs.io.files import READ_ERRORS, as_utf8, atomic_path, file_kind, fir
 __all__ = ["read_matches", "read_table", "write_table"]
 
 
-# What has to stand in quotes in a field.
+# Characters that require quotes around a field.
 _SPECIAL = re.compile(r'[\s"#]')
 
 
@@ -26,7 +26,7 @@ def write_table(table, path, *, overwrite=False):
     Parameters
     ----------
     table : `~astropy.table.Table`
-        Columns of numbers and strings.
+        Table with columns of numbers and strings.
     path : path-like
         File to write.
     overwrite : bool, optional
@@ -41,8 +41,8 @@ def write_table(table, path, *, overwrite=False):
 
     Notes
     -----
-    The header is astropy's own; the rows are written here, in less than half the time, every float
-    with the digits that bring it back exactly.
+    The header is written by astropy.  The rows are written here, in less than half the time, and
+    with enough digits to read every float back exactly.
 
     Examples
     --------
@@ -61,21 +61,21 @@ def write_table(table, path, *, overwrite=False):
     ):
         text = _text_of(plain)
     else:
-        # One row of header is what names the columns in ECSV.
+        # The only header line that is not a comment has the names of the columns.
         text = _text_of(plain[:0]) + _rows_of(plain)
     with atomic_path(path, overwrite=overwrite) as temporary:
         temporary.write_text(as_utf8(text), encoding="utf-8")
 
 
 def read_table(path, *, columns=()):
-    r"""Read a table that `write_table` wrote, or any other that astropy reads.
+    r"""Read a table that was written by `write_table`, or any other table that astropy can read.
 
     Parameters
     ----------
     path : path-like
-        File in ECSV, CSV, FITS, ...; the format is told by name and content.
+        File in ECSV, CSV, FITS, ...; name and content show the format.
     columns : sequence of str, optional
-        Columns that must be there and be numeric or boolean.
+        Columns that must exist and be numeric or boolean.
 
     Returns
     -------
@@ -130,7 +130,7 @@ def read_matches(path):
     Parameters
     ----------
     path : path-like
-        ``<stem>.matches.ecsv``.
+        File ``<stem>.matches.ecsv``.
 
     Returns
     -------

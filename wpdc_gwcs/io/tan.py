@@ -1,4 +1,4 @@
-"""Headers of the tangent plane, read exactly: TAN, TPV, TAN + PV.  Only here pixels count from one.
+"""Exact reading of TAN, TPV and TAN + PV headers, in which pixels are counted from one.
 
 ::
 
@@ -24,20 +24,20 @@ __all__ = ["PV_CARD", "TanHeader", "idle_pv", "parse_tan", "require_place"]
 #: Keywords of projection parameters: axis and index.
 PV_CARD = re.compile(r"PV([12])_(\d+)")
 _TABLE_CARD = re.compile(r"(CPDIS|CQDIS|D2IMDIS)[12]")
-# SIP whatever CTYPE says, and the plate solution of the Digitized Sky Survey.
+# SIP, regardless of CTYPE, and the plate solution of the Digitized Sky Survey.
 _DISTORTION_CARD = re.compile(r"[AB]_ORDER|AMDX1")
 _LONGITUDES = ("RA", "GLON", "ELON")
 _LATITUDES = ("DEC", "GLAT", "ELAT")
-# Highest PV index of each degree, the radial term of odd degrees included.
+# Highest PV index of each degree, including the radial term of odd degrees.
 _LAST_INDEX = {1: 3, 2: 6, 3: 11, 4: 16, 5: 23, 6: 30, 7: 39}
 _RADIAL = (3, 11, 23, 39)
-# Longitudes of some programs run on after a turn; of those further off nothing but noise is left.
+# Some programs let longitudes run on after a full turn; larger ones are meaningless.
 _FARTHEST_LONGITUDE = 720.0  # deg
 
 
 @dataclass(frozen=True, eq=False)
 class TanHeader:
-    """The numbers of a TAN, TPV or TAN + PV header, axes in the order RA, Dec.
+    """The numbers of a TAN, TPV or TAN + PV header, with the axes in the order RA, Dec.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class TanHeader:
     pv : `~wpdc_gwcs.models.PVPolynomial`
         Distortion of (xi, eta); the identity for a plain TAN header.
     image_shape : (int, int) or None
-        ``(ny, nx)``, where the header tells.
+        Shape ``(ny, nx)``; `None` if the header does not have it.
     """
 
     crpix: np.ndarray
@@ -60,12 +60,12 @@ class TanHeader:
     image_shape: tuple[int, int] | None = None
 
     def to_wcs(self):
-        """Build the `astropy.wcs.WCS` that says the same.
+        """Build the equivalent `astropy.wcs.WCS`.
 
         Returns
         -------
         wcs : `~astropy.wcs.WCS`
-            TPV, or TAN where there is no distortion; RA is the first world axis.
+            TPV, or TAN if there is no distortion; RA is the first world axis.
         """
         coefficients = self.pv.coefficients
         distorted = not np.array_equal(coefficients, PVPolynomial(self.pv.degree).coefficients)
@@ -115,15 +115,15 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
     Raises
     ------
     InputError
-        If the axes are not celestial, a card is missing or not a number, CD is singular, or the PV
-        terms are.
+        If the axes are not celestial, a card is missing or not a number, or CD or the PV terms are
+        singular.
 
     Notes
     -----
-    ``RA---TAN`` with PV cards of index 5 or more, or with any on the Dec axis, is TPV, as SCAMP
-    wrote it before version 2.0.  Absent PV cards have the defaults of the convention, 0, and 1 for
-    PVi_1; but where one axis has all terms of its degree and the other lacks some of them, a card
-    was lost.
+    ``RA---TAN`` with PV cards of index 5 or more, or with any PV card on the Dec axis, is TPV, as
+    written by SCAMP before version 2.0.  Absent PV cards have the default values of the convention:
+    1 for PVi_1, and 0 for the others.  But if one axis has all terms of its degree and the other
+    axis does not, a card has been lost, which is an error.
     """
     order, codes = _celestial_axes(header, name, error)
     if codes[0] not in ("TAN", "TPV") or header_text(header, "CTYPE1")[:2] not in ("RA", "DE"):
@@ -142,7 +142,7 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
         j >= 5 or (axis == latitude and j >= 1) for axis, j in numbers
     )
     if codes[0] == "TAN" and not is_tpv and numbers:
-        # PV on the RA axis of a plain TAN moves the native pole: rare enough to leave to wcslib.
+        # PV on the RA axis of a plain TAN moves the native pole, which is rare and left to wcslib.
         return None
 
     def number(key, **options):
@@ -176,21 +176,21 @@ def parse_tan(header, *, name="header", error=FileFormatError, ignore_tables=Fal
 
 
 def require_place(longitude, latitude, name, error):
-    """Refuse a reference point that is no place on a sphere.
+    """Raise an error unless a reference point is a position on the sphere.
 
     Parameters
     ----------
     longitude, latitude : float
-        ``CRVAL``, deg.
+        Values of ``CRVAL``, deg.
     name : str
         Name of the header in messages.
     error : type
-        Class of the error.
+        Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
 
     Raises
     ------
     InputError
-        If the longitude is more than two turns off or the latitude is beyond the poles.
+        If the longitude is outside -720 to 720 deg, or the latitude outside -90 to 90 deg.
     """
     if not abs(longitude) <= _FARTHEST_LONGITUDE:
         raise error(
@@ -202,8 +202,8 @@ def require_place(longitude, latitude, name, error):
 
 
 def _require_area(pv, cd, crpix, shape, name, error):
-    """Refuse terms that put the image into a line or a point."""
-    # Not at the reference point, where radial terms have no derivatives.
+    """Raise an error for terms that map the image to a line or a point."""
+    # Away from the reference point, where radial terms have no derivatives.
     place = crpix + 1.0 if shape is None else 0.3 * np.array(shape[::-1])
     area = np.linalg.det(pv.jacobian(*(cd @ (place - crpix))))
     if not abs(area) > 0:
@@ -211,7 +211,7 @@ def _require_area(pv, cd, crpix, shape, name, error):
 
 
 def idle_pv(header):
-    """Return whether all PV cards of a TAN header are zero, and so say nothing.
+    """Return whether all PV cards of a TAN header are zero, so that they have no meaning.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def idle_pv(header):
     Returns
     -------
     bool
-        As a TPV polynomial, they would put the whole frame into one point.
+        True if all are zero; as a TPV polynomial, they would map the whole frame to one point.
     """
     if not header_text(header, "CTYPE1").upper().endswith("TAN"):
         return False
@@ -230,7 +230,7 @@ def idle_pv(header):
 
 
 def _celestial_axes(header, name, error):
-    """Which axis is longitude and which latitude, and their projection codes."""
+    """Numbers of the longitude and latitude axes, and their projection codes."""
     types = [header_text(header, f"CTYPE{axis}").upper() for axis in (1, 2)]
     kinds = [t[:5].strip("-").split("-")[0] for t in types]
     order = None
@@ -282,7 +282,7 @@ def _linear(header, order, number, name, error):
                 [number(key.format(i, j), required=False, default=float(i == j)) for j in (1, 2)]
                 for i in (1, 2)
             ]
-            # Beside PC, CDELT is 1 unless it is there (paper I, section 2.1.2).
+            # With PC, the default of CDELT is 1 (paper I, section 2.1.2).
             steps = [number(f"CDELT{i}", required=False, default=1.0) for i in (1, 2)]
             return np.array(steps)[:, None] * np.array(pc)
     if "CDELT1" not in header and "CDELT2" not in header:

@@ -1,4 +1,4 @@
-"""Dates and times as people write them: to modified Julian dates."""
+"""Conversion of dates and times in many spellings to modified Julian dates."""
 
 import re
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class Timestamp:
     has_time : bool
         Whether the time of day is known.
     system : str or None
-        Time system that the text names, ``UTC`` where it has a zone; `None` if it names none.
+        Time system in the text, ``UTC`` if there is a time zone; `None` if there is none.
     """
 
     mjd: float
@@ -43,7 +43,7 @@ _DATES = tuple(
         r"(?P<d>\d{1,2})[-/.](?P<m>\d{1,2})[-/.](?P<y>\d{4}|\d{2})(?!\d)",
         r"(?P<d>\d{1,2})[-/ .,]*(?P<m>[a-z]{3,9})[-/ .,]*(?P<y>\d{4}|\d{2})(?!\d)",
         r"(?P<m>[a-z]{3,9})[-/ .,]+(?P<d>\d{1,2})(st|nd|rd|th)?[-/ ,]+(?P<y>\d{4})(?!\d)",
-        # as C writes it, the year behind the time
+        # As C writes it, with the year after the time.
         r"(?P<m>[a-z]{3})\s+(?P<d>\d{1,2})\s+(?P<t>[\d:.]+)\s+(?P<y>\d{4})(?!\d)",
     )
 )
@@ -55,7 +55,7 @@ _CLOCKS = tuple(
         r"(?P<h>\d{2})(?P<m>\d{2})(?P<s>\d{2}(\.\d*)?)",
     )
 )
-# Two-digit years are of the last century (FITS), but for those of which there are no frames.
+# Two-digit years are of the 20th century (FITS), except for years in which there were no frames.
 _FIRST_YEAR = 40
 _UNIX_EPOCH_MJD, _UNIX_EPOCH = 40587, date(1970, 1, 1)
 
@@ -71,7 +71,7 @@ def read_clock(text):
     Returns
     -------
     float or None
-        Fraction of a day; `None` if it is no time.
+        Fraction of a day; `None` if the text is not a time.
 
     Examples
     --------
@@ -92,23 +92,23 @@ def read_clock(text):
 
 
 def read_timestamp(text):
-    """Read a date, with a time of day where there is one.
+    """Read a date with an optional time of day.
 
     Parameters
     ----------
     text : str
-        Year first, day first or with the name of the month; with ``T``, blanks or colons before
-        the time; with a zone or a time system at the end.
+        Date with the year first, the day first or the name of the month; with ``T``, blanks or
+        colons before the time; with a time zone or a time system at the end.
 
     Returns
     -------
     Timestamp or None
-        `None` if it is no date.
+        The date; `None` if the text is not a date.
 
     Notes
     -----
-    Of two numbers before the year, the day is the first, as in the first version of FITS, unless
-    only the other way makes a date.
+    If two numbers come before the year, the first one is the day, as in the first version of FITS,
+    unless only the reverse order is a valid date.
 
     Examples
     --------

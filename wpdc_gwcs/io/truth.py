@@ -5,7 +5,7 @@
     {"frames": {name: {"wcs": gwcs in stock models, exact to rounding}, ...},
      "truth": {format_version, detectors, frames, ...}}
 
-The first is for everyone, the second is what `read_truth` makes maps of, with their exact inverses.
+The first part is for everyone.  From the second one, `read_truths` makes maps with exact inverses.
 Layout of ``truth``, format version 1.0.0, all plain YAML:
 
 ================== =============================================================================
@@ -43,19 +43,19 @@ _FORMAT_VERSION = "1.0.0"
 
 
 def true_wcs(truth, *, first_step=None):
-    """Build the true WCS of a frame of stock models.
+    """Build the true WCS of a frame from stock models.
 
     Parameters
     ----------
     truth : FrameTruth
         The truth about the frame.
     first_step : `~astropy.modeling.Model`, optional
-        The distortion of its detector, where it was built before.
+        Model of the distortion of its detector, if it has already been built.
 
     Returns
     -------
     `gwcs.WCS`
-        From ``detector`` over ``undistorted`` to ``icrs``, exact to rounding (1e-8 px).
+        WCS with the frames ``detector``, ``undistorted`` and ``icrs``, exact to rounding (1e-8 px).
     """
     linear = truth.linear_wcs.wcs
     stock = to_stock_wcs(build_wcs(crpix=linear.crpix - 1, cd=linear.cd, crval=linear.crval))
@@ -119,13 +119,13 @@ def write_truths(truths, path, *, camera, catalog, files, overwrite=False):
     catalog : str
         File of the reference catalog.
     files : sequence of (str, str)
-        File of each frame, and whether it is a "list" or an "image".
+        File of each frame, and "list" or "image".
     overwrite : bool, optional
         Whether an existing file may be replaced.
     """
     from wpdc_gwcs import __version__
 
-    # One model for all frames of a detector, which the file then has once.
+    # All frames of a detector share a model, so the file contains it once.
     distortions = {t.detector: t.distortion for t in truths}
     first_steps = {name: _stock_distortion(one) for name, one in distortions.items()}
     tree = {
@@ -159,14 +159,14 @@ def read_truths(path):
     Parameters
     ----------
     path : path-like
-        File that `write_truths` wrote.
+        File that was written by `write_truths`.
 
     Returns
     -------
     tree : dict
-        What is in ``truth``.
+        Content of ``truth`` in the file.
     truths : dict
-        Name of a frame to `~wpdc_gwcs.simulation.FrameTruth`.
+        `~wpdc_gwcs.simulation.FrameTruth` of each frame, by name.
 
     Raises
     ------
