@@ -65,9 +65,9 @@ class GaiaArchive:
         Cache folder; default: ``WPDC_GWCS_CACHE`` of the environment, else the cache folder that
         astropy would use for this package.
     max_mag : float, optional
-        G magnitude of the faintest stars to request.
+        G magnitude of the faintest stars to request; default: 20.5.
     table : str, optional
-        Table of the service, with the columns of ``gaia_source``.
+        Table of the service, with the columns of ``gaia_source``; default: that of Gaia DR3.
 
     Examples
     --------

@@ -165,7 +165,7 @@ class StarFits:
 
     @classmethod
     def unfitted(cls, stars):
-        """Start values in the place of fits, for those without a flux none."""
+        """Return start values in place of fits; those without a flux are invalid."""
         n = len(stars.x)
         return cls(stars, np.full((n, 3, 3), np.nan), np.full(n, np.nan), stars.flux > 0)
 
@@ -191,7 +191,7 @@ class StarFits:
 
 
 def fit_radius(fwhm):
-    """Radius in px of the pixels that stars are fitted on.
+    """Return the radius of the pixels to which stars are fitted.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def fit_radius(fwhm):
     Returns
     -------
     float
-        Radius.
+        Radius in px: 1.25 FWHM, but at least 2.5 px.
     """
     return max(1.25 * fwhm, 2.5)
 

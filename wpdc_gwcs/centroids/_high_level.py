@@ -60,8 +60,13 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
     Returns
     -------
     `~photutils.psf.ImagePSF`, `~photutils.psf.GriddedPSFModel` or None
-        The PSF, four samples per pixel; None, with a `CentroidWarning`, where there are too few
-        stars.
+        The PSF, with four samples per pixel; None if there are too few stars.
+
+    Raises
+    ------
+    ValueError
+        If ``vary`` has a wrong value, if ``error`` is missing for a plain array, invalid, or given
+        with a Background, or if the sources have no FWHM.
 
     Warns
     -----
@@ -116,7 +121,12 @@ def measure_psf(
     Returns
     -------
     Profile or None
-        The PSF; None, with a `CentroidWarning`, where there are too few stars.
+        The PSF; None if there are too few stars.
+
+    Raises
+    ------
+    ValueError
+        As for `build_epsf`.
 
     Warns
     -----
@@ -205,6 +215,12 @@ def fit_centroids(
         ``snr``, and ``chi2``, the chi square per degree of freedom.  If a fit fails, the old values
         are kept, ``flags`` has `wpdc_gwcs.detection.FLAG_FIT_FAILED`, and ``chi2`` is NaN.  The
         flag is also set if a fit is far worse than those of sources of similar brightness.
+
+    Raises
+    ------
+    ValueError
+        If ``passes`` is less than 1, if ``error`` is missing for a plain array, invalid, or given
+        with a Background, if the sources have no FWHM, or if the PSF cannot be converted.
 
     Notes
     -----
@@ -398,6 +414,12 @@ def measure_noise(data, sources, epsf, *, error=None):
     -------
     StarNoise
         Gain, error of the PSF, number of stars.
+
+    Raises
+    ------
+    ValueError
+        If ``error`` is missing for a plain array, invalid, or given with a Background, if the
+        sources have no FWHM, or if the PSF cannot be converted.
 
     Notes
     -----

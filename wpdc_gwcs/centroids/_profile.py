@@ -299,7 +299,7 @@ def moffat_samples(shape, half, oversampling):
     Parameters
     ----------
     shape : (4,) array_like
-        Logarithm of the half width in px, logarithm of beta - 1, and two ellipticities.
+        Logarithm of half the FWHM in px, logarithm of beta - 1, and two ellipticities.
     half : int
         Half-width of the grid in px.
     oversampling : int

@@ -108,7 +108,12 @@ def evaluate(dx, dy, *, sigma=3.0):
     Returns
     -------
     ResidualStatistics
-        All NaN, with ``n = 0``, if there are no stars.
+        Statistics; all NaN, with ``n = 0``, if there are no stars.
+
+    Raises
+    ------
+    ValueError
+        If ``sigma`` is not positive.
 
     Examples
     --------
@@ -181,7 +186,12 @@ def binned_residuals(x, y, dx, dy, *, image_shape, n_bins=20):
     mean_dx, mean_dy : (n_bins, n_bins) `numpy.ndarray`
         Means in px, indexed ``[iy, ix]``, NaN for empty cells.
     count : (n_bins, n_bins) `numpy.ndarray` of int
-        Stars in each cell.
+        Number of stars in each cell.
+
+    Raises
+    ------
+    ValueError
+        If ``n_bins`` is less than 1.
 
     Examples
     --------
@@ -228,6 +238,11 @@ def running_statistics(values, dx, dy, *, n_bins=10):
     `~astropy.table.QTable`
         One row per bin: ``low``, ``middle`` (median) and ``high`` of the values, and the fields of
         `ResidualStatistics`, in px.
+
+    Raises
+    ------
+    ValueError
+        If ``n_bins`` is less than 1.
 
     Examples
     --------

@@ -19,8 +19,8 @@ class RadialWeight:
     Parameters
     ----------
     name : {'exp-sqrt', 'gaussian', 'inverse', 'inverse-square', 'uniform'}, optional
-        Weighting function outside ``r0``; inside, every weight is 1.  The paper's ``w1`` to ``w4``
-        are the first four.
+        Weighting function outside ``r0``; inside, every weight is 1.  The names ``w1`` to ``w4`` of
+        the paper are also accepted, for the first four.
     r0 : float, optional
         Radius in px within which all stars have the same weight.
 

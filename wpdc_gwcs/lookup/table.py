@@ -55,6 +55,8 @@ def build_lookup_table(
     ------
     FitError
         If ``lut`` is ``always`` and the map has too few stars or bins, or if there is no map.
+    ValueError
+        If ``lut`` has a wrong value, or ``n_grid`` is not between 4 and 1000.
 
     Notes
     -----

@@ -48,7 +48,7 @@ def match_sources(
     epoch : float or `~astropy.time.Time`, optional
         Epoch of the frame in Julian years, to which the catalog is moved.  By default, the
         catalog is used as it is.
-    max_roundness, min_snr : float
+    max_roundness, min_snr : float, optional
         Selection of the sources, see `select_sources`.
     max_mag : float, optional
         Magnitude of the faintest reference stars used.
@@ -61,7 +61,7 @@ def match_sources(
         One row per pair: ``source_index``, ``catalog_index`` (rows of the inputs, zero based),
         ``x``, ``y`` [pix] as measured, ``ra``, ``dec`` [deg] of the reference star at the epoch,
         ``dx``, ``dy`` [pix] the source minus its reference star in pixels of the starting WCS, and
-        ``separation`` [pix] the distance that remains after the smooth mapping.
+        ``separation`` [pix] the remaining distance after the smooth mapping.
     diagnostics : MatchDiagnostics
         Evidence, the smooth mapping found, timings.
 
@@ -70,7 +70,9 @@ def match_sources(
     MatchError
         If the evidence for a match is insufficient; the message says why.
     ValueError
-        If a column is missing or has the wrong unit.
+        If a column is missing or has the wrong unit, or the WCS cannot be used.
+    TypeError
+        If the sources or the catalog are neither a table nor coordinates.
 
     Examples
     --------

@@ -28,8 +28,8 @@ class MatchOptions:
     max_order : int
         Highest order of the smooth mapping.
     min_significance : float
-        Minimum significance of the pairs over chance, sigma; 0.7 of it is enough if there are so
-        few stars that all possible mappings are counted.
+        Minimum significance of the pairs over chance, sigma; 0.58 times this is enough if there are
+        so few stars that all possible mappings are counted.
     min_purity : float
         Minimum fraction of correct pairs.
 

@@ -50,7 +50,8 @@ class LookupTable(Model):
     Raises
     ------
     ValueError
-        If the nodes are too few, not equally spaced or not finite, or the shapes do not agree.
+        If the nodes are too few or not equally spaced, a value is not finite, the shapes do not
+        agree, or the method is unknown.
 
     Notes
     -----
@@ -103,7 +104,7 @@ class LookupTable(Model):
         self.outputs = ("dx", "dy")
 
     def __getstate__(self):
-        # The spline is worked out again where it is needed.
+        # The spline is computed again when it is needed.
         return {**self.__dict__, "_cache": None}
 
     def __repr__(self):
