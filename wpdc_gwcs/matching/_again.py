@@ -23,19 +23,19 @@ def pair_again(xs, ys, xr, yr, i_src, i_ref, *, image_shape):
     Parameters
     ----------
     xs, ys : (N,) array_like
-        Positions of the sources, px; corrected for whatever is known of the distortion.
+        Positions of the sources, px, corrected for the known distortion.
     xr, yr : (M,) array_like
         Positions of the reference stars in the same plane, px.
     i_src, i_ref : (n,) array_like of int
-        Rows of the pairs that are known.
+        Rows of the known pairs.
     image_shape : (int, int)
         Shape of the frame, ``(ny, nx)``.
 
     Returns
     -------
     i_src, i_ref : (n,) ndarray of int
-        Rows of the new pairs, in order of the source row; the old ones if they are too few for a
-        prediction.
+        Rows of the new pairs, in the order of the source rows; the known pairs if there are too few
+        of them for a prediction.
 
     Raises
     ------
@@ -44,9 +44,9 @@ def pair_again(xs, ys, xr, yr, i_src, i_ref, *, image_shape):
 
     Notes
     -----
-    A smooth mapping is fitted to the pairs, and a moving local plane to the residuals; each source
-    is paired within 5.5 times the robust scatter of pairs left out, if there is exactly one star
-    and that star has no other source.
+    A smooth mapping is fitted to the pairs, and a moving local plane to its residuals.  A source is
+    paired within 5.5 times the robust scatter of left-out pairs, if there is exactly one star and
+    this star has no other source.
 
     Examples
     --------

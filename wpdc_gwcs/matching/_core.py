@@ -1,4 +1,4 @@
-"""The core: two lists of plane positions in, one-to-one pairs and their evidence out."""
+"""The core of the match: from two lists of plane positions to one-to-one pairs with evidence."""
 
 import time
 
@@ -81,7 +81,7 @@ def match_planes(
     Raises
     ------
     MatchError
-        If the evidence for a match is missing; the message says which.
+        If the evidence for a match is insufficient; the message says what is missing.
     ValueError
         If lengths or options are not valid.
 

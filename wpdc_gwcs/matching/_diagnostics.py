@@ -86,7 +86,7 @@ class MatchDiagnostics:
         freeze_attributes(self, "areas", "timings")
 
     def to_dict(self):
-        """Return the plain numbers (no mapping, areas summed up) for tables and files."""
+        """Return plain numbers for tables and files: no mapping, and a summary of the areas."""
         judged = [a for a in self.areas if a.judged]
         plain = {
             name: getattr(self, name)

@@ -27,27 +27,27 @@ _N_SHIFTS = 10
 _PER_AREA = 16.0
 _JUDGED = 8.0
 _MOST_AREAS = 16
-# Probability that a correct match is refused because of the counts in any part: some of many parts
-# have few pairs.  Parts are compared with the first fraction of the pairs that the better parts
-# suggest, and are always good with the second one.
+# Probability that a correct match is refused because of too few pairs in some part.  Parts need not
+# have more than the first fraction of the pairs expected from the better parts, and are always good
+# with more than the second fraction.
 _PARTS_CHANCE = 0.01
 _PROMISED, _PLENTY = 0.8, 0.4
 # Minimum number of pairs by chance in a part, even if none was seen.
 _LEAST_BY_CHANCE = 1e-3
 # Maximum number of stars counted in circles: more would not improve the verdict.
 _COUNTED = 60_000
-# Share of the significance that is needed where all that the search could choose from is counted:
-# 9 sigma (3e-18) leave twelve orders of magnitude for the hypotheses of a search, 5.2 sigma (1e-6)
-# are what is left.  As all ways are counted as if each led to another match it is an upper limit:
-# of 1500 random fields, in clusters and in rows too, none reached more than 0 sigma.
+# Fraction of the required significance if all mappings that the search could choose from are
+# counted: 9 sigma (3e-18) leave twelve orders of magnitude for the hypotheses of a search, without
+# which 5.2 sigma (1e-6) are enough.  The count is an upper limit, as if each choice led to another
+# match: of 1500 random fields, including clusters and rows, none reached more than 0 sigma.
 _SEARCH_SHARE = 0.58
 # Number of orientations of the axes that a blind search tries.
 _ORIENTATIONS = 8
-# Leave-one-out residuals of pairs on which the mapping hangs are not looked at more closely, nor
-# shares of the radius at which positions are not independent.
+# Maximum leverage in leave-one-out residuals, for pairs that determine the mapping, and minimum
+# fraction of the radius, below which positions are not independent.
 _MOST_LEVERAGE = 0.99
 _LEAST_SHARE = 1e-3
-# Parts of the sources, those with the smallest radii, of which the one that says most is taken.
+# Fractions of the sources, those with the smallest radii; the most significant one is used.
 _WIDEST = (0.5, 0.7, 0.85, 1.0)
 # The distance to this neighbor gives the local density of reference stars.
 _DENSITY_NEIGHBOR = 6
@@ -59,7 +59,7 @@ _ORDER_PAIRS = (5, 100)
 
 @dataclass(frozen=True)
 class AreaEvidence:
-    """Evidence in one part of the frame: a circle about a position; circles overlap.
+    """Evidence in one part of the frame: a circle, which may overlap others.
 
     Parameters
     ----------
@@ -75,7 +75,8 @@ class AreaEvidence:
     judged : bool
         Whether there are enough stars for a judgment.
     accepted : bool
-        Whether the pairs exceed chance and are not far fewer than expected; true where not judged.
+        Whether the pairs exceed chance and are not far fewer than expected; also true if the area
+        is not judged.
 
     Examples
     --------
@@ -104,7 +105,7 @@ class AreaEvidence:
 class Evidence:
     """Numbers by which a match is accepted or refused.
 
-    `search_significance` is that of `judge_few`, NaN for many stars.
+    The ``search_significance`` comes from `judge_few`; it is NaN for many stars.
     """
 
     n_pairs: int
@@ -118,14 +119,14 @@ class Evidence:
     search_significance: float = np.nan
 
     def is_significant(self, min_significance):
-        """Whether the pairs exceed chance, by counts or by the number of possible mappings."""
+        """Return whether the pairs exceed chance, by counts or by possible mappings."""
         return (
             self.significance >= min_significance
             or self.search_significance >= _SEARCH_SHARE * min_significance
         )
 
     def missing(self, options):
-        """Say what is missing for the match to be accepted; an empty string if nothing is."""
+        """Describe what is missing for the match to be accepted; an empty string if nothing is."""
         min_significance, min_purity = options.min_significance, options.min_purity
         if not self.is_significant(min_significance):
             searched = ""
@@ -157,12 +158,12 @@ class Evidence:
 
 
 def poisson_significance(count, expected):
-    """Return the probability of at least `count` events with mean `expected`, in sigmas.
+    """Return the significance of at least `count` events with the mean `expected`, in sigmas.
 
     Notes
     -----
-    Uses sqrt(-2 ln P), with P bounded by the leading terms of the Poisson tail, which holds where
-    P underflows.
+    This is sqrt(-2 ln P), with an upper limit of P from the leading terms of the Poisson tail,
+    which also works if P underflows.
     """
     if count <= expected:
         return 0.0
@@ -181,9 +182,9 @@ def judge_few(
 ):
     r"""Return the significance of a short list against all mappings that could be found.
 
-    With a few stars the chance level cannot be counted: at no shift there is a pair, and whether
-    one in ten shifts or in a thousand is to be expected makes all the difference.  Here it follows
-    from the density of reference stars, and what the search could choose from is counted instead.
+    With few stars, the chance level cannot be counted: there are no pairs at any shift, and it
+    would be decisive whether one is expected in ten shifts or in a thousand.  Here the chance level
+    comes from the density of reference stars, and the choices of the search are counted instead.
 
     Parameters
     ----------
@@ -202,32 +203,32 @@ def judge_few(
     shape : (int, int)
         Shape of the frame.
     reaches : (float, float, float)
-        Largest displacement that is searched: of a source, of a source against another one, and
-        what is left of it without the linear part, px.
+        Largest displacements in the search, px: of a source, of a source relative to another one,
+        and of a source without the linear part.
     brightness : (ndarray, ndarray), optional
         Brightness of the sources and of the reference stars, in any units that rise with it.
 
     Returns
     -------
     float
-        As `poisson_significance`.
+        Significance in sigmas, as from `poisson_significance`.
 
     Notes
     -----
-    A mapping of T terms per axis can be laid through any T pairs, and what other pairs it makes is
-    evidence.  Of N sources there are :math:`\binom N T` sets, and each source of a set may be one
-    of the :math:`m_k` stars in its reach.  So the expected number of mappings that have n pairs by
-    chance is at most
+    A mapping with T terms per axis fits any T pairs exactly, so only further pairs are evidence.
+    There are :math:`\binom{N}{T}` sets of N sources, and each source of a set may be one of the
+    :math:`m_k` stars in its reach.  So the expected number of mappings that have n pairs by chance
+    is at most
 
     .. math::
-        \binom N T \prod_{k=1}^T m_k \; P(\ge n - T \mid \lambda)
+        \binom{N}{T} \prod_{k=1}^T m_k \; P(\ge n - T \mid \lambda) ,
 
-    where the fourth and later stars of a set can be no further from where the first three put them
-    than the distortion reaches.  P is taken at the share of the pairing radii that says most, from
-    residuals of pairs predicted by the others, and for the part of the sources up to the radius
-    that says most; both choices are counted too.  Wrong pairs are in no order of brightness: the
-    chance of the order that they have (Kendall) is independent of P, and the product q of the two
-    is worth :math:`q (1 - \ln q)` (Fisher).
+    where the first three stars of a set predict the others to within the distortion.  P is the most
+    significant value over fractions of the pairing radii, with residuals of pairs predicted by the
+    others, and over parts of the sources with small radii.  Both choices are counted, too.  Wrong
+    pairs are not in the order of brightness.  The chance of the observed order (Kendall) is
+    independent of P, and the product q of the two has the probability :math:`q (1 - \ln q)`
+    (Fisher).
     """
     i, j = pairs
     log_chance = _log_chance_of_places(points, mapped, radius, leverage, stars, terms, pairs, shape)
@@ -249,9 +250,9 @@ def _log_chance_of_places(points, mapped, radius, leverage, stars, terms, pairs,
     residual = np.hypot(*(mapped[i] - stars.points[j]).T)
     share = residual / (1 - np.minimum(leverage[i], _MOST_LEVERAGE)) / radius[i]
     log_chance = 0.0
-    # where the mapping is ill known radii are so wide that they say nothing, and hide the rest
+    # Where the mapping is poorly known, the radii are so wide that they would hide the evidence.
     for widest in np.quantile(radius, _WIDEST):
-        # the k-th is the share of the radii within which there are k pairs, at most all
+        # The k-th value is the fraction of the radii within which there are k pairs.
         shares = np.minimum(np.sort(share[radius[i] <= widest]), 1.0)[terms:]
         count = np.arange(1, len(shares) + 1)
         level = expected[radius <= widest].sum() * np.maximum(shares, _LEAST_SHARE) ** 2
@@ -271,7 +272,7 @@ def _log_choices(points, mapped, stars, terms, pairs, reaches):
     against = moved - moved.mean(axis=0)
     place = points[i] - points[i].mean(axis=0)
     bent = against - place @ np.linalg.lstsq(place, against, rcond=None)[0]
-    # a mapping that reaches further than the limits could have been laid through more pairs
+    # A mapping that reaches beyond the limits could have been fitted to more pairs.
     sizes = [
         max(reach, float(np.hypot(*offset.T).max()))
         for reach, offset in zip(reaches, (moved, against, bent), strict=True)
@@ -285,10 +286,10 @@ def _log_choices(points, mapped, stars, terms, pairs, reaches):
 
 
 def _expected_within(mapped, radius, is_paired, stars, shape):
-    """Say how many reference stars chance puts within the radius of each source.
+    """Compute how many reference stars are expected by chance within the radius of each source.
 
-    From the distance to one of the nearest stars, in pixels and in units of the sides of the
-    frame: on a narrow frame a circle that holds enough stars is mostly outside of it.
+    This comes from the distance to one of the nearest stars, in pixels and in units of the sides of
+    the frame, because on a narrow frame a circle with enough stars is mostly outside.
     """
     k = min(_DENSITY_NEIGHBOR, stars.tree.n)
     sides = np.array(shape[::-1], float)
@@ -301,9 +302,9 @@ def _expected_within(mapped, radius, is_paired, stars, shape):
 
 
 def log_chance_of_order(one, other):
-    """Logarithm of the chance that two lists without relation are in as similar an order.
+    """Return the log probability that two unrelated lists are in as similar an order.
 
-    From the number of inversions (Kendall's tau), exactly.
+    It is exact, from the number of inversions (Kendall's tau).
     """
     fewest, most = _ORDER_PAIRS
     known = np.isfinite(one) & np.isfinite(other)
@@ -313,7 +314,7 @@ def log_chance_of_order(one, other):
     n_inversions = np.count_nonzero(
         np.subtract.outer(one, one) * np.subtract.outer(other, other) < 0
     )
-    # the k-th value may stand before 0 to k - 1 of the others, each equally likely
+    # The k-th value comes before 0 to k - 1 of the others with equal probabilities.
     chance = np.ones(1)
     for k in range(2, len(one) + 1):
         chance = np.convolve(chance, np.full(k, 1.0 / k))
@@ -332,24 +333,25 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
     stars : Stars
         The reference stars.
     mapping : SmoothMap
-        The mapping, which takes degrees of freedom.
+        The mapping, whose terms are degrees of freedom.
     pairs : (i_src, i_ref)
         The pairs.
     image_shape : (int, int)
         Shape of the frame.
-    slack : float
+    slack : float, optional
         As used to find the pairs, see `find_edges`.
 
     Returns
     -------
     Evidence
+        The evidence.
 
     Notes
     -----
-    The chance level is counted, not modeled: the mapped sources are shifted against the reference
-    by vectors far longer than the radius (but short against the scale on which the density changes)
-    and paired again. Each term of the mapping can bring one pair into line, so the significance
-    counts the pairs less the terms.
+    The chance level is counted, not modeled.  The mapped sources are shifted against the reference
+    stars and paired again.  The shifts are much longer than the radius, but shorter than the scale
+    on which the density changes.  Each term of the mapping can make one pair fit, so the
+    significance is that of the number of pairs minus the number of terms.
     """
     ny, nx = image_shape
     i_src, i_ref = pairs
@@ -364,7 +366,7 @@ def collect_evidence(detector, mapped, radius, stars, mapping, pairs, image_shap
     inside = on_detector(back_x, back_y, image_shape)
     n_reference = int(np.count_nonzero(inside))
     n_sources = len(detector)
-    # half a pair in all shifts together where none was seen
+    # If there is none at all, half a pair in all shifts together.
     floor = 0.5 * hit_weight
     terms = count_terms(mapping.order)
     unpaired = max(0.0, 1 - n_pairs / max(1, n_sources))
@@ -398,7 +400,7 @@ def _count_by_chance(mapped, radius, stars, slack):
     base = max(15.0, 6 * float(np.median(radius)))
     hits = []
     for k in range(_N_SHIFTS):
-        # golden-angle spiral: directions and lengths without a common period
+        # A golden-angle spiral: directions and lengths have no common period.
         length = base * (1 + 2 * (k + 0.5) / _N_SHIFTS)
         shift = length * np.array([np.cos(2.39996 * k), np.sin(2.39996 * k)])
         i, j, _ = find_edges(mapped + shift, stars.tree, radius, limit=stars.limit, slack=slack)
@@ -427,19 +429,19 @@ def _judge_areas(sources, reference, pairs, chance, weight, image_shape):
     if len(chance):
         by_chance = cKDTree(chance).query_ball_point(nodes, radius, return_length=True)
         by_chance = by_chance * weight / step
-    # expect what the better parts have: an average would include the bad ones
+    # The better parts set the expectation, because an average would include the bad ones.
     shares = [
         np.quantile(n_pairs[n > 0] / n[n > 0], 0.75) if n.any() else 0.0
         for n in (n_sources, n_reference)
     ]
     expected = np.minimum(shares[0] * n_sources, shares[1] * n_reference)
-    # enough that zero pairs would be too improbable for any of so many parts
+    # Enough that zero pairs would be too improbable in any of the parts.
     n_parts = np.count_nonzero(expected >= _JUDGED)
     needed = max(_JUDGED, np.log(max(n_parts, 1) / _PARTS_CHANCE) / _PROMISED)
     judged = expected >= needed
     too_few = pdtr(n_pairs, _PROMISED * expected)
     enough = (too_few > _PARTS_CHANCE / max(n_parts, 1)) | (n_pairs > _PLENTY * expected)
-    # chance must explain the pairs less well than a match with some losses
+    # Chance has to explain the pairs less well than a match with some losses.
     floor = max(0.5 * weight / step, _LEAST_BY_CHANCE)
     too_many = pdtrc(n_pairs - 1.0, np.maximum(by_chance, floor))
     too_many = np.where(n_pairs > 0, too_many, 1.0)

@@ -1,9 +1,9 @@
 """Neighbor patterns: identification of stars from relative positions alone.
 
-Around every star its neighbors are noted as ``(log d, theta)``.  A common rotation and scale of the
-neighborhood is a common shift in that plane, so two stars are compared by looking for the shift at
-which most of their neighbors coincide; how many coincide by chance follows from how many
-differences there are.
+The neighbors of a star are described by ``(log d, theta)``.  A common rotation and scale of the
+neighborhood is a common shift in that plane.  So two stars are compared by finding the shift at
+which most of their neighbors coincide.  The number of coincidences expected by chance follows from
+the number of differences.
 """
 
 from dataclasses import dataclass
@@ -48,13 +48,13 @@ def density_ratio_map(xs, ys, xr, yr, image_shape, *, per_cell=40.0):
         Positions of sources and reference stars, px.
     image_shape : (int, int)
         Shape of the frame, ``(ny, nx)``.
-    per_cell : float
-        Cells are made large enough for this many stars of the sparser list on average.
+    per_cell : float, optional
+        Mean number of stars of the sparser list in a cell, which sets the size of the cells.
 
     Returns
     -------
     ratio : (ny_cells, nx_cells) ndarray
-        Sources per reference star; one star is added to both counts, so that empty cells say 1.
+        Sources per reference star; one star is added to both counts, so empty cells have 1.
     x_edges, y_edges : ndarray
         Edges of the cells, px.
     """
@@ -83,7 +83,7 @@ def neighbor_pattern(tree, rows, n_neighbors):
     Returns
     -------
     log_distance, angle : (n, k) ndarray
-        Natural logarithm of the distance in px and direction in rad; NaN where a list has too few
+        Natural logarithm of the distance in px, and direction in rad; NaN if the list has too few
         stars.
     neighbor : (n, k) ndarray of int
         Row of each neighbor.
@@ -100,14 +100,15 @@ def neighbor_pattern(tree, rows, n_neighbors):
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Candidates that source i is reference star j, with local scale and rotation.
+    """Candidate pairs of a source and a reference star, with local scale and rotation.
 
     Parameters
     ----------
     source, reference : (n,) ndarray of int
         Rows in the two lists.
     log_scale, rotation : (n,) ndarray
-        Reference neighborhood relative to the source's, rotation in rad.
+        Natural logarithm of the scale, and rotation in rad, of the neighborhood of the reference
+        star relative to that of the source.
     count, expected : (n,) ndarray
         Number of coinciding neighbors, and number expected by chance.
     surprise : (n,) ndarray
@@ -206,8 +207,8 @@ def compare_patterns(
     order = np.lexsort((-surprise, anchor_of))
     first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     rank = np.arange(len(order)) - np.repeat(first, sizes)
-    # A star is one reference star at most, so second-best candidates are wrong and show how far
-    # chance goes among so many: make 10**-surprise the probability for a single wrong candidate.
+    # A star is at most one reference star, so second-best candidates are wrong and show what chance
+    # produces: 10**-surprise becomes the probability of a single wrong candidate.
     second = surprise[order[(rank == 1)]]
     if len(second):
         surprise = surprise - max(0.0, np.median(second) - np.log10(np.median(sizes) / 2 + 1))
@@ -272,7 +273,7 @@ def _fullest_boxes(pair, d_log, d_angle, n, max_log_scale, max_rotation):
         n_angle = int(2 * max_rotation / width) + 3
         per_pair = n_angle * (int(2 * max_log_scale / width) + 3)
         promising = np.zeros(len(pair), bool)
-        # a narrow box that is no less surprising says more about scale and rotation
+        # Of two equally surprising boxes, the narrower one is more accurate in scale and rotation.
         best = np.where(surprise > 0, np.nextafter(surprise, 0), 0.0)
         for edge in ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5)):
             box = ((d_log + max_log_scale) / width + edge[0]).astype(np.int64) * n_angle
@@ -285,7 +286,7 @@ def _fullest_boxes(pair, d_log, d_angle, n, max_log_scale, max_rotation):
             now = -np.log10(np.maximum(gammainc(count, chance), 1e-300))
             better = np.flatnonzero(now > best[owner])
             better = better[np.lexsort((now[better], owner[better]))]
-            # the last of each owner is its best
+            # The last box of each owner is its best.
             better = better[np.diff(owner[better], append=-1) != 0]
             owner = owner[better]
             best[owner] = surprise[owner] = now[better]
@@ -299,7 +300,7 @@ def _fullest_boxes(pair, d_log, d_angle, n, max_log_scale, max_rotation):
 def _count_in_boxes(box, n_boxes):
     """Boxes with enough members, their counts, and which members are in such a box."""
     if n_boxes > _DENSE * len(box):
-        # few members in many boxes: keep only the boxes that have any
+        # With few members in many boxes, keep only boxes with members.
         order = np.argsort(box, kind="stable")
         start = np.flatnonzero(np.diff(box[order], prepend=-1))
         count = np.diff(start, append=len(box))
@@ -325,9 +326,8 @@ def select_coherent(
 ):
     """Find groups of consistent hypotheses.
 
-    Two hypotheses agree when the local scale and rotation of one predict where the other one's star
-    is, within the width of its box and what the curvature of the distortion may add over the
-    distance between them.
+    Two hypotheses agree if the local scale and rotation of one predict the position of the other,
+    within the width of its box and the curvature of the distortion over the distance between them.
 
     Parameters
     ----------
@@ -338,18 +338,18 @@ def select_coherent(
     curvature : float
         Largest second derivative of the distortion, 1/px.
     density : float
-        Reference stars per square pixel, which says how often two agree by chance.
+        Reference stars per square pixel, for the probability that two agree by chance.
     max_difference : float
         Largest difference of scale and rotation that was allowed.
-    max_seeds : int
-        Groups to return.
-    most : int
-        Hypotheses to look at.
+    max_seeds : int, optional
+        Maximum number of groups.
+    most : int, optional
+        Maximum number of hypotheses that are used.
 
     Returns
     -------
     list of (support, rows)
-        For each group the sum of its surprises and its rows in `hypotheses`, best first.
+        Sum of the surprises of each group, and its rows in `hypotheses`, best first.
     """
     h = hypotheses.take(slice(0, most))
     if len(h) == 0:
@@ -379,7 +379,7 @@ def select_coherent(
     worth = h.surprise[None] - np.log10((1 + density * np.pi * tolerance**2) * share)
     worth = np.where(agree & (h.source[:, None] != h.source[None]), np.maximum(worth, 0.0), 0.0)
     np.fill_diagonal(worth, h.surprise)
-    # a source counts once in a group: its best hypothesis there
+    # A source counts once in a group, with its best hypothesis.
     order = np.argsort(h.source, kind="stable")
     starts = np.flatnonzero(np.concatenate([[True], np.diff(h.source[order]) > 0]))
     support = np.maximum.reduceat(worth[:, order], starts, axis=1).sum(axis=1)

@@ -129,8 +129,8 @@ def grow_locally(problem, points, limit, fit, pairs):
             scatter = plane_scatter(*(residual - local(points[i], leave_out=True)[0]).T)
         mapped, leverage = predict(points, fit, local)
         error = scatter * np.sqrt(1 + leverage)
-        # where stars are sparse, a wider radius is harmless, and lets the mapping follow
-        # unexpected distortion
+        # A wider radius is harmless where stars are sparse, and the mapping can follow unexpected
+        # distortion.
         near = find_nearest(reference.tree, mapped, 1)[1]
         harmless = _HARMLESS * np.minimum(limit, reference.limit[near])
         radius = np.maximum(_GROW_RADIUS * error, np.minimum(_WIDE_RADIUS * error, harmless))
@@ -148,7 +148,7 @@ def final_radius(problem, mapped, pairs, scatter, leverage):
         i, j = pairs
         difference = mapped[i] - problem.stars.points[j]
         error = problem.errors[i]
-        # the unexplained scatter is the same for all: take it from the best stars
+        # The unexplained scatter is the same for all stars, so it is measured from the best ones.
         small = error <= np.quantile(error, _BEST_SHARE)
         floor = max(0.0, plane_scatter(*difference[small].T) ** 2 - np.median(error[small]) ** 2)
         factor = plane_scatter(*(difference / np.sqrt(error**2 + floor)[:, None]).T)
@@ -172,7 +172,7 @@ def pair(mapped, radius, limit, reference):
 
 
 def predict(sources, fit, local):
-    """Map positions; also the variance of that in units of the variance of one pair."""
+    """Map positions, and compute the variance in units of the variance of one pair."""
     mapped = np.column_stack(fit.mapping(*sources.T))
     leverage = fit.leverage(*sources.T)
     if local is None:

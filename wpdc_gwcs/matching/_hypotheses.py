@@ -182,8 +182,8 @@ def _choose_anchors(problem, sources, rank, n_anchors):
     first = np.concatenate([[True], cell[order][1:] != cell[order][:-1]])
     starts = np.flatnonzero(first)
     place = np.arange(n) - np.repeat(starts, np.diff(np.append(starts, n)))
-    # empty cells leave room for second stars of full ones; central stars first, where the
-    # distortion is weakest as a rule
+    # Empty cells leave room for second stars of full ones; central stars come first, because the
+    # distortion is usually weakest there.
     chosen = order[np.argsort(place, kind="stable")[:n_anchors]]
     return chosen[np.argsort(np.hypot(*(sources[chosen] - problem.frame.center).T))]
 
@@ -208,7 +208,7 @@ def first_pairs(sources, reference, hypotheses, n_neighbors):
         alone = _neighbor_pairs(sources, reference, hypotheses.take(slice(0, 1)), n_neighbors)
         yield alone
         if n_neighbors > N_NEIGHBORS:
-            # most neighbors are missing in the other list: many coincidences are by chance
+            # Most neighbors are missing in the other list, so many coincidences are due to chance.
             agreeing = _agreeing_pairs(sources.points, reference.points, alone)
             if agreeing is not None:
                 yield agreeing
@@ -227,7 +227,7 @@ def _agreeing_pairs(sources, reference, pairs):
     at, to = sources[i], reference[j]
     design = np.dstack([np.ones((_N_TRIPLES, 3)), at[triples]])
     size = np.abs(np.linalg.det(design))
-    # three stars on a line do not determine a mapping
+    # Three stars on a line do not determine a mapping.
     triples, design = triples[size > np.median(size)], design[size > np.median(size)]
     linear = np.linalg.solve(design, to[triples])
     left = np.column_stack([np.ones(len(i)), at]) @ linear - to
@@ -253,7 +253,7 @@ def _neighbor_pairs(sources, reference, hypotheses, n_neighbors):
     i = np.concatenate([hypotheses.source, neighbor[good]])
     j = np.concatenate([hypotheses.reference, found[good]])
     relative = np.concatenate([np.zeros(len(hypotheses)), relative[good]])
-    # one pair per star of either list: the closest
+    # One pair per star of either list: the closest one.
     for side in (0, 1):
         order = np.lexsort((relative, (i, j)[side]))
         _, first = np.unique((i, j)[side][order], return_index=True)

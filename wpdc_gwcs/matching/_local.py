@@ -50,8 +50,9 @@ class LocalCorrection:
         ----------
         positions : (M, 2) ndarray
             Starting positions, px.
-        leave_out : bool
-            The positions are the pairs themselves: use the neighbors of each pair only.
+        leave_out : bool, optional
+            Whether the positions are the pairs themselves, so that each pair is left out of its own
+            correction.
 
         Returns
         -------
@@ -70,7 +71,7 @@ class LocalCorrection:
             x, y = step[..., 0], step[..., 1]
             sx, sy = x.sum(1), y.sum(1)
             sxx, sxy, syy = (x * x).sum(1), (x * y).sum(1), (y * y).sum(1)
-            # first column of the inverse of the normal matrix of a + b x + c y
+            # The first column of the inverse of the normal matrix of a + b x + c y.
             a, b, c = sxx * syy - sxy**2, sxy * sy - sx * syy, sx * sxy - sxx * sy
             determinant = N_NEIGHBORS * a + sx * b + sy * c
             good = determinant > 1e-6 * N_NEIGHBORS * sxx * syy

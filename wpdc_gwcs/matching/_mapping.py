@@ -15,17 +15,16 @@ __all__ = [
 ]
 
 MAX_ORDER = 7
-# Pairs that a fit of n terms needs at least: fewer, and leave-one-out errors no longer mean
-# anything.
+# Minimum number of pairs per term of a fit; with fewer, leave-one-out errors are meaningless.
 PAIRS_PER_TERM = 2.0
-# On a frame as narrow as this (short side by long side) the second and higher powers of the short
-# direction are worth less than a pixel where a distortion is 250 px: 250 * 0.05**2 = 0.6.  As long
-# as there are pairs for no more than this order, they take no part, to the gain of higher powers
-# of the long one.
+# On a frame as narrow as this (short side divided by long side), the second and higher powers of
+# the short direction are less than a pixel for a distortion of 250 px: 250 * 0.05**2 = 0.6.  While
+# there are only enough pairs for this order, these powers are left out in favor of higher powers of
+# the long direction.
 _NARROW = 0.05
 _NARROW_ORDER = 3
-# Below this scatter (px) differences are round-off: it keeps noise-free input from ending in a
-# zero radius.
+# Minimum scatter, px: smaller differences are rounding errors, and noise-free input would lead to a
+# radius of zero.
 SMALLEST_SCATTER = 1e-5
 _BLOCK = 65536
 
@@ -182,9 +181,9 @@ class SmoothMap:
     def inverse(self, x, y, *, iterations=12):
         """Find the starting positions of mapped ones by fixed-point iteration.
 
-        The displacement is evaluated no further than 5 % outside the frame, where a polynomial
-        is still meaningful; accurate to a fraction of a pixel, which is enough to count stars in
-        the frame.
+        The displacement is evaluated up to 5 % outside the frame, where a polynomial is still
+        meaningful.  The result is accurate to a fraction of a pixel, which is enough to count the
+        stars on the frame.
         """
         x, y = np.asarray(x, float), np.asarray(y, float)
         cx, cy = self.center
@@ -286,7 +285,7 @@ def fit_smooth_map(
             top += 1
         if top == 0:
             return fit
-        # Fewer pairs seldom carry a higher order: those of a narrow frame may.
+        # Fewer pairs rarely allow a higher order, except on a narrow frame.
         if whole.shape[1] < count_terms(top):
             whole = _design(u, v, top)
         design = whole[:, columns[: size[top]]]

@@ -24,7 +24,7 @@ _MAX_CHANCE = 1e-5
 # Maximum number of stars in the search for the shift: more would not improve its peak.
 _MOST_STARS = 300
 _MOST_OFFSETS = 400_000
-# Sides of the boxes in which offsets are counted, px: as the offsets may agree.
+# Sides of the boxes in which offsets are counted, px.
 _BOXES = (1.5, 4.0, 10.0, 25.0, 60.0)
 # Maximum number of peaks to follow.
 _N_PEAKS = 4
@@ -32,7 +32,7 @@ _N_PEAKS = 4
 # lower one, and pairs that disagree more than the upper one prove nothing.
 _N_SIGMA = 5.0
 _RADII = (0.5, 6.0)
-# Another shift with this fraction of the pairs is as good: the field repeats itself.
+# A second shift with this fraction of the pairs means that the field repeats itself.
 _RIVAL_SHARE = 0.7
 # Minimum number of pairs for a rotation and scale, and for a full linear mapping.
 _FOR_SIMILARITY, _FOR_LINEAR = 3, 6
@@ -89,14 +89,15 @@ def match_nearby(
     Raises
     ------
     MatchError
-        If the pairs could be by chance, or there are too few.
+        If there are too few pairs, or they could be due to chance.
 
     Notes
     -----
-    Pair offsets are counted in boxes; from the most surprising boxes a linear mapping grows within
-    the given bounds.  With n pairs found where chance gives :math:`\lambda` of the radius r, the
-    evidence is the Poisson tail :math:`P(\ge n)` times the number of mappings that the search has
-    tried, at most :math:`(1 + s/r)^2 (1 + b/r)^4` for the shift s and the bend b allowed.
+    The offsets of pairs are counted in boxes, and a linear mapping grows from the most surprising
+    boxes within the given bounds.  If n pairs are found within the radius r, and chance predicts
+    :math:`\lambda` of them, the evidence is the Poisson tail :math:`P(\ge n \mid \lambda)` times
+    the number of mappings that the search has tried.  This is at most
+    :math:`(1 + s/r)^2 (1 + b/r)^4` for the largest shift s and bend b.
 
     Examples
     --------
@@ -113,7 +114,7 @@ def match_nearby(
     local = np.column_stack([xs, ys]), np.column_stack([xr, yr])
     sources, reference = local
     if tiles is not None:
-        # side by side, further apart than the range of any search
+        # Side by side, farther apart than the range of any search.
         step = np.array([100.0 * (max(image_shape) + max_shift + max_bend), 0.0])
         sources, reference = (
             p + np.asarray(t, float)[:, None] * step for p, t in zip(local, tiles, strict=True)
@@ -193,8 +194,8 @@ def _brightest(points, brightness, *, inside=None):
     if inside is None:
         order = np.argsort(np.where(np.isfinite(brightness), -brightness, np.inf), kind="stable")
         return order[:_MOST_STARS]
-    # magnitudes, of a list that reaches beyond the frame: twice as many, since the cuts never
-    # correspond exactly
+    # Magnitudes of a list that reaches beyond the frame: it gets twice as many stars, because the
+    # cuts in flux and magnitude never correspond exactly.
     order = np.argsort(np.where(np.isfinite(brightness), brightness, np.inf), kind="stable")
     ny, nx = inside
     on_frame = ((points > 0) & (points < [nx, ny])).all(axis=1)[order]
@@ -229,7 +230,7 @@ def _peaks(sources, reference, max_shift, max_bend):
     peaks.sort(key=lambda p: -p[0])
     chosen = []
     for _, shift, width in peaks:
-        # the same peak in boxes of another size or grid is not a new start
+        # The same peak in boxes of another size or grid is not a new start.
         if all(np.hypot(*(shift - s)) > 0.7 * min(width, w) for s, w in chosen):
             chosen.append((shift, width))
         if len(chosen) == 2 * _N_PEAKS:
@@ -255,7 +256,7 @@ def _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend
         if key == before:
             break
         before = key
-        # never wider: stars far off at the edge are reached as the mapping rotates
+        # Never wider: as the mapping rotates, it reaches the stars at the edge.
         radius = float(np.clip(_N_SIGMA * scatter, _RADII[0], max(0.7 * radius, _RADII[0])))
     radius = float(np.clip(_N_SIGMA * scatter, *_RADII))
     bend = np.linalg.norm(linear[1:], 2) * scale
@@ -268,7 +269,7 @@ def _grow(sources, at, reference, tree, scale, shift, reach, max_shift, max_bend
     by_chance = _by_chance(moved, i, tree, radius)
     trials = 2 * np.log1p(max_shift / radius) + 4 * np.log1p(max_bend / radius)
     n = len(i)
-    # leading terms of the Poisson tail, an upper bound for n well above the mean
+    # Leading terms of the Poisson tail: an upper limit for n well above the mean.
     log_chance = 0.0
     if n > by_chance:
         log_chance = n * np.log(by_chance) - by_chance - gammaln(n + 1)
@@ -321,7 +322,7 @@ def _by_chance(moved, paired, tree, radius):
     wide = max(10 * radius, 1.5 * _typical_distance(tree))
     near = tree.query_ball_point(moved, wide, return_length=True).astype(float)
     near[paired] -= 1
-    # half a star if none is near, because the density is not zero
+    # Half a star if none is near, because the density is not zero.
     return float(np.sum(np.maximum(near, 0.5)) * (radius / wide) ** 2)
 
 

@@ -29,18 +29,17 @@ def find_edges(points, tree, radius, *, limit=None, slack=1.0):
     radius : (N,) ndarray
         Reach of each point; a point with radius <= 0 or NaN has no partners.
     limit : (M,) ndarray, optional
-        Largest radius that may be used to reach each partner (where partners stand close, a wide
-        radius says nothing).
-
-    slack : float
-        A radius larger than the limit of a partner counts as the limit up to this factor; beyond,
-        the partner is out of reach.
+        Largest radius at each partner; where partners are close to each other, a wide radius is
+        meaningless.
+    slack : float, optional
+        Up to this factor, a radius larger than the limit of a partner counts as the limit.  Beyond
+        it, the partner is out of reach.
 
     Returns
     -------
     i, j : (n,) ndarray of int
-        Edges: ``i`` is a row of `points`, ``j`` of the tree.  At most three edges per point: two
-        already make it ambiguous.
+        Edges: ``i`` is a row of `points`, ``j`` a row of the tree.  There are at most three edges
+        per point, because two already make it ambiguous.
     distance : (n,) ndarray
         Length of each edge.
     """
@@ -56,7 +55,7 @@ def find_edges(points, tree, radius, *, limit=None, slack=1.0):
     partner = partner.reshape(len(active), -1)
     inside = distance <= reach[:, None]
     if limit is not None:
-        # the tree returns index n for no partner
+        # The tree returns index n if there is no partner.
         allowed = np.append(limit, 0.0)[partner]
         inside &= (reach[:, None] <= slack * allowed) & (distance <= allowed)
     row, column = np.nonzero(inside)

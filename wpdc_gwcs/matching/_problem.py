@@ -24,11 +24,12 @@ __all__ = [
 MIN_STARS = 8
 # Maximum number of stars expected by chance within a radius.
 MAX_CROWDING = 0.25
-# Displacement by distortion that is searched for, px; on a small detector as a share of its side:
-# what such a limit allows in scale and rotation grows as the detector shrinks.
+# Largest displacement by distortion in the search, px, and as a fraction of the side of a small
+# detector, where the limit in px would allow too much scale and rotation.
 _MAX_DISTORTION = 250.0
 _MAX_DISTORTION_SHARE = 0.12
-# Error of the pointing that is searched for: px, and share of the longer side; in a blind search.
+# Largest error of the pointing in the search: px, and fraction of the longer side; the fraction in
+# a blind search.
 _MAX_SHIFT, _MAX_SHIFT_SHARE, _BLIND_SHIFT_SHARE = 450.0, 0.15, 0.3
 # Minimum scale error allowed in a blind search: some headers have the scale of another binning.
 BLIND_SCALE = 0.06
@@ -189,7 +190,7 @@ def _prepare(name_x, name_y, x, y, brightness, name_brightness):
             )
         brightness = brightness[rows]
         known = np.isfinite(brightness)
-        # with ties or gaps in more than half of the values there is no useful order
+        # With ties or gaps in more than half of the values, the order is useless.
         if known.sum() < 0.5 * len(rows) or len(np.unique(brightness[known])) < 0.5 * known.sum():
             brightness = None
         else:

@@ -8,8 +8,8 @@ __all__ = ["find_rival_offset"]
 _MOST_OFFSETS = 50_000
 _FEWEST_SOURCES = 50
 _MOST_SOURCES = 1000
-# Widths of the boxes in which offsets are counted, in pairing radii: where one pattern is found
-# through another one's mapping the offsets may agree much better than that mapping's scatter.
+# Widths of the boxes in which offsets are counted, in pairing radii.  The offsets of a repeated
+# pattern may agree much better than the scatter of the mapping.
 _BOX_WIDTHS = (2.0, 0.5, 0.125)
 # Fraction of the paired sources that must have a partner at the rival offset, too.
 _LEAST_SHARE = 0.5
@@ -24,7 +24,7 @@ def find_rival_offset(mapped, partner, tree, radius, *, center, max_offset):
     mapped : (N, 2) ndarray
         Mapped positions of the paired sources, px.
     partner : (N,) ndarray of int
-        The reference star of each.
+        Row of the reference star of each source.
     tree : `~scipy.spatial.cKDTree`
         Tree of all reference stars.
     radius : float
@@ -37,11 +37,11 @@ def find_rival_offset(mapped, partner, tree, radius, *, center, max_offset):
     Returns
     -------
     (2,) ndarray or None
-        The offset, px, or `None` if no other one fits half of the sources.
+        The offset, px; `None` if no other offset fits half of the sources.
 
     Notes
     -----
-    The offsets of all reference stars from all sources are counted in boxes, wide ones first; the
+    The offsets of all reference stars from all sources are counted in boxes, wide ones first.  The
     box with the most improbable count is the rival.
     """
     area = np.pi * max_offset**2
@@ -62,7 +62,7 @@ def find_rival_offset(mapped, partner, tree, radius, *, center, max_offset):
         per_row = int(2 * max_offset / width) + 3
         expected = density * width**2
         promising = np.zeros(len(offset), bool)
-        # four staggered grids: no box straddles an edge on all of them
+        # Four staggered grids: an offset cannot be at the edge of a box on all of them.
         for edge in ((0.0, 0.0), (0.0, 0.5), (0.5, 0.0), (0.5, 0.5)):
             column, row = ((offset - low) / width + edge).astype(np.int64).T
             _, box, count = np.unique(

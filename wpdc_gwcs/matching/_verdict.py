@@ -38,8 +38,8 @@ __all__ = [
 # If either list has no more stars than this on the frame, `judge_few` is used as well; with more,
 # correct matches have enough pairs to count the chance level.
 _FEW = 100
-# Significance and purity below which the pairs of a subset are not carried to the whole frame: it
-# only spares hopeless starts the full round.
+# Significance and purity below which the pairs of a subset are not carried to the whole frame, to
+# save time with hopeless starts.
 _HOPELESS_SIGNIFICANCE, _HOPELESS_PURITY = 4.0, 0.5
 # Of two matches, the one with less than this fraction of the evidence (in -2 ln P) of the other is
 # worse; and the greatest number of times that a better one is searched for.
@@ -47,7 +47,7 @@ _EQUAL = 0.7
 _MOST_RIVALS = 4
 # Pairs agree with a match within this many radii; "most" means more than this fraction.
 _EXPLAINED, _MOST = 3.0, 0.5
-# No header is right up to a rotation and yet so far off in the area of a pixel: that is a mirror.
+# A header with such a wrong area of a pixel cannot be correct up to a rotation: it is a mirror.
 _MOST_STRETCH = 2.0
 
 _HINT = (
@@ -85,7 +85,7 @@ class Attempts:
     """Unsuccessful attempts so far."""
 
     best: Evidence | None = None
-    # starts that match except in a part of the frame
+    # Starts that match except in a part of the frame.
     n_partial: int = 0
 
     def after(self, evidence, *, partial=False):
@@ -149,7 +149,7 @@ def judge_pairs(problem, turn, pairs, attempts, clock):
     clock.lap("evidence")
     options = problem.options
     if evidence.missing(options):
-        # right as a whole but for a part of the frame: other starts seldom help
+        # Correct except in a part of the frame: other starts rarely help.
         partial = evidence.is_significant(options.min_significance)
         return None, attempts.after(evidence, partial=partial)
     return Match(turn, fit.mapping, mapped, radius, pairs, n_ambiguous, scatter, evidence), attempts
@@ -241,7 +241,7 @@ def header_error(problem, match):
     of_pairs = np.linalg.lstsq(place - place.mean(axis=0), mapped - mapped.mean(axis=0), None)[0].T
     area = float(np.linalg.det(of_pairs))
     if not 1 / _MOST_STRETCH < area < _MOST_STRETCH:
-        # on a narrow frame a mirror is within reach of the other limits
+        # On a narrow frame, a mirrored mapping may be within the other limits.
         return MatchError(
             f"the starting WCS is mirrored or stretched: the pairs change the area of the "
             f"frame by a factor of {area:.3g}{_hint(problem)}"
