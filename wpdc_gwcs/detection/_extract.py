@@ -228,8 +228,8 @@ def star_size(image, x, y):
     Returns
     -------
     (float, float) or None
-        FWHM of a circular star of the same size, and FWHM along the minor axis, px; None if no
-        source has a size.
+        FWHM of a round star of the same size, and FWHM along the minor axis, px; None if no source
+        has a size.
     """
     xc, yc = np.rint(x).astype(int), np.rint(y).astype(int)
     fwhm = sharpest = 2.0

@@ -19,7 +19,7 @@ _TOUCHING = np.ones((3, 3), bool)
 
 
 def high_cells(image, rms, mask, line, factor):
-    """Mark the cells with a pixel that is above a threshold once the image is smoothed.
+    """Mark the cells in which the smoothed image exceeds a threshold.
 
     Parameters
     ----------

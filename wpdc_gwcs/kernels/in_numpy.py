@@ -42,11 +42,11 @@ _GREATEST_ANGLE = 1e9
 
 _MAX_NEWTON = 25
 
-# Points whose coefficients are worked on at a time, a compromise: fewer stay closer to the core,
-# more keep threads from waiting for each other.
+# Number of points whose coefficients are processed at a time: a compromise, because fewer points
+# stay in the cache, and more keep threads from waiting for each other.
 _PART_SIZE = 16384
 
-# Pixels of whole rows of an image that are worked on at a time.
+# Number of pixels in whole rows of an image that are processed at a time.
 _PIECE_SIZE = 65536
 
 # Coefficients of the highest power last (fdlibm).
@@ -140,7 +140,7 @@ def _sin_cos(angle):
     return sine, cosine
 
 
-# From where on, y / x, the arc tangent is taken from which angle, and what that lacks in digits.
+# Lower limits of y / x, the angle to which the arc tangent is added, and the rest of its digits.
 _STEPS = (
     (0.4375, 4.63647609000806093515e-01, 2.26987774529616870924e-17),
     (0.6875, 7.85398163397448278999e-01, 3.06161699786838301793e-17),
@@ -198,7 +198,7 @@ def _wrap(ra):
 def _locate(x, low, step, n):
     s = x - low
     s *= 1.0 / step
-    # The outer cells take what is beyond, NaN stays NaN in s.
+    # Points farther out belong to the outer cells; NaN stays NaN in s.
     i = np.floor(np.minimum(np.maximum(s, -1.0), n))
     s -= i
     i += 1.0
@@ -599,7 +599,7 @@ def _solve_near_and_far(plane, start, limits, a, b, index, x_out, y_out):
     x, y = a, b
     if start is not None:
         if start.table.size:
-            # Held at the edge: points farther out have no solution anyway.
+            # Clipped to the edge: points farther out have no solution anyway.
             x, y = _hold(a, *start.head[:2]), _hold(b, *start.head[3:5])
         x, y = _values(start, x, y)
     if plane.table.size:

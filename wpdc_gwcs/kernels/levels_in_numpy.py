@@ -19,13 +19,14 @@ def count_levels(image, mask, rows, columns, low, rate, counts):
     image : (ny, nx) float32 ndarray
         The image.
     mask : (ny, nx) bool ndarray or None
-        True for pixels that do not count.
+        True for pixels that are not used.
     rows, columns : (M + 1,), (N + 1,) ndarray
-        First rows and columns of the cells, whole numbers, and those behind the last cell.
+        First rows and columns of the cells, followed by the row and column after the last cell;
+        whole numbers.
     low, rate : (M * N,) float32 ndarray
-        The lowest value that counts, and the number of steps per unit, of every cell.
+        Lowest value, and number of steps per unit, for each cell.
     counts : (M * N, 256) intc ndarray
-        The numbers of pixels in each step are written here.
+        The number of pixels in each step is written here.
     """
     rows, columns = rows.astype(int), columns.astype(int)
     widths = np.diff(columns)
@@ -45,20 +46,20 @@ def count_levels(image, mask, rows, columns, low, rate, counts):
 
 
 def put_cubics(coefficients, edges, offset, subtract, image):
-    """Write piecewise cubics into the rows of an image, or take them off it.
+    """Write piecewise cubics into the rows of an image, or subtract them from it.
 
     Parameters
     ----------
     coefficients : (ny, N, 4) float32 ndarray
-        Those of every piece in every row, the highest power first.
+        Coefficients of each piece in each row, the highest power first.
     edges : (N + 1,) ndarray
-        First columns of the pieces, whole numbers, and the one behind the last.
+        First columns of the pieces, followed by the column after the last one; whole numbers.
     offset : (nx,) float32 ndarray
-        Argument of the cubics in every column.
+        Argument of the cubics in each column.
     subtract : bool
-        Whether the cubics are taken off the image.
+        Whether the cubics are subtracted from the image instead of written into it.
     image : (ny, nx) float32 ndarray
-        The image.
+        The image, changed in place.
     """
     widths = np.diff(edges.astype(int))
     c = (np.repeat(coefficients[:, :, k], widths, axis=1) for k in range(4))

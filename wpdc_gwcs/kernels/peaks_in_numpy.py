@@ -9,24 +9,24 @@ __all__ = ["mark_cells"]
 
 
 def mark_cells(image, rms, mask, line, factor, size, first, last, cells):
-    """Mark the cells of an image with a pixel that is above a threshold once it is smoothed.
+    """Mark the cells of an image in which the smoothed image exceeds a threshold.
 
     Parameters
     ----------
     image, rms : (ny, nx) float32 ndarray
         The image, and its noise.
     mask : (ny, nx) bool ndarray or None
-        True for pixels that count as 0, as those beyond the image do.
+        True for pixels that count as 0, like those outside the image.
     line : (2 n + 1,) float32 ndarray
-        Weights of the filter along each axis, the same from both ends.
+        Symmetric weights of the filter along each axis.
     factor : float
         The threshold, in units of the noise.
     size : int
         Side of the cells in px.
     first, last : int
-        The first row of cells that is looked at, and the one behind the last.
+        The first row of cells to process, and the row after the last one.
     cells : (my, mx) bool ndarray
-        Cells are marked here.
+        Marked cells become True here.
     """
     n_rows, n_columns = image.shape
     half = len(line) // 2

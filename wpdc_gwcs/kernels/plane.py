@@ -6,7 +6,7 @@ import numpy as np
 
 __all__ = ["Plane", "arrange", "arranged", "box_numbers", "tangent_numbers"]
 
-# Where a table begins in memory: no cell of it lies across more cache lines than it fills.
+# Alignment of a table in memory, so that a cell does not use more cache lines than necessary.
 _ALIGNMENT = 64
 
 
@@ -60,7 +60,7 @@ def arrange(coefficients, order):
 
 
 def arranged(table, order):
-    """Return the coefficients of `arrange` again, a view.
+    """Return the coefficients from the table of `arrange`, as a view.
 
     Parameters
     ----------

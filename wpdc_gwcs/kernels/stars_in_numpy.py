@@ -1,7 +1,7 @@
 """The kernels of stars in NumPy, for installations without a compiler.
 
-A point-spread function is a sum of few grids of coefficients of cubic B-splines.  All pixels of a
-star have the same phase in the grid, so each star has only 4 x 4 weights and the shares of the
+A point-spread function is a sum of a few grids of coefficients of cubic B-splines.  All pixels of a
+star have the same phase in the grid, so a star needs only 4 x 4 weights and the shares of the
 grids.
 """
 
@@ -31,8 +31,8 @@ def star_profiles(grids, oversampling, phase, shares, half, profiles):
     half : int
         The cut-outs are 2 half + 1 px wide.
     profiles : (1 or 3, N, (2 half + 1)^2) ndarray
-        Values, and if there is room for them derivatives by the position of the star along x and
-        y, are written here.
+        The values are written here and, if there is room for them, the derivatives with respect to
+        the position of the star along x and y.
     """
     base_x, taps_x, slopes_x = phase[:, 0], phase[:, 1:5], phase[:, 5:9]
     base_y, taps_y, slopes_y = phase[:, 9], phase[:, 10:14], phase[:, 14:18]
@@ -98,7 +98,7 @@ def paint_stars(grids, oversampling, phase, shares, half, center, flux, image):
 
 
 def take_stars(center, half, first, last, light, image):
-    """Take light off an image in the pixels of the stars that were painted.
+    """Subtract light from an image in the pixels of painted stars.
 
     Parameters
     ----------
@@ -107,9 +107,9 @@ def take_stars(center, half, first, last, light, image):
     half : int
         The cut-outs are 2 half + 1 px wide.
     first, last : int
-        The first row of the image that changes, and the one behind the last.
+        The first row of the image that changes, and the row after the last one.
     light : (ny, nx) float32 ndarray
-        The light; it becomes zero in all these pixels.
+        The light; it becomes zero in these pixels.
     image : (ny, nx) float32 ndarray
         The image.
     """
@@ -147,15 +147,15 @@ def star_steps(profiles, flux, pixels, use, variance, photons, noise, step, cova
     variance : (N, n) ndarray
         Variance without the star.
     photons : (N, n) ndarray or None
-        Variance of photons relative to what the gain says; 1 for `None`.
+        Variance of photons relative to that from the gain; 1 for `None`.
     noise : (2,) ndarray
         Counts per electron, and the error of the profile relative to its peak.
     step : (N, 3) ndarray
         Steps of x, y and flux are written here; zero where the equations are singular.
     covariance : (N, 3, 3) ndarray
-        Covariance of the steps; NaN there.
+        The covariance of the steps is written here; NaN where the equations are singular.
     chi2 : (N,) ndarray
-        Chi square per degree of freedom.
+        Chi square per degree of freedom is written here.
     """
     model = flux[:, None] * profiles[0]
     light = np.maximum(model, 0)

@@ -18,16 +18,16 @@ __all__ = ["BLOCK_SIZE", "evaluate_blocks", "run_blocks"]
 #: Points per block where one thread works: the work arrays stay in a core's second-level cache.
 BLOCK_SIZE = 16384
 
-# Points per block where several do.  A thread that finds the interpreter lock taken sleeps and is
-# woken, which costs some 50 us; steps this long make that rare.
+# Number of points in a block for several threads.  A thread that has to wait for the interpreter
+# lock loses about 50 us, which is rare with blocks of this size.
 _THREADED_BLOCK_SIZE = 131072
 
-# Below this many points the threads cost more than they bring.
+# With fewer points, threads take more time than they save.
 _THREADED_SIZE = 65536
 
-# glibc hands freed memory back to the system, and faults it in again for the next block, unless it
-# has seen a block of up to 32 MB come and go: then it keeps twice as much.  Elsewhere this does
-# nothing.
+# glibc returns freed memory to the system and has to get it again for the next block, unless a
+# block of up to 32 MB has been freed before: then it keeps twice as much.  Elsewhere, this has no
+# effect.
 _KEEP_BYTES = 31 * 2**20
 
 
@@ -37,7 +37,7 @@ def _keep_freed_memory():
 
 
 def run_blocks(function, size, *, weight=1):
-    """Call ``function(start, stop)`` over ``range(size)`` in blocks, threaded when it is worth it.
+    """Call ``function(start, stop)`` for blocks of ``range(size)``, in threads if that saves time.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def run_blocks(function, size, *, weight=1):
     if n_threads == 1:
         step = max(1, BLOCK_SIZE // weight)
     else:
-        # As many blocks for one thread as for the other.
+        # The same number of blocks for each thread.
         n_blocks = n_threads * math.ceil(size * weight / (_THREADED_BLOCK_SIZE * n_threads))
         step = max(1, math.ceil(size / n_blocks))
     starts = range(0, size, step)
@@ -77,10 +77,10 @@ def evaluate_blocks(function, *inputs, n_outputs=2):
     Parameters
     ----------
     function : callable
-        Takes contiguous 1-D float64 arrays and writes as many outputs of the same length.
+        Function of contiguous 1-D float64 arrays: the inputs, and the outputs that it writes.
     *inputs : array_like
-        Mutually broadcastable; scalars, empty and multi-dimensional arrays are welcome.  What is
-        masked in one of them is masked in all outputs.
+        Inputs that broadcast: scalars, empty or multi-dimensional arrays.  Elements that are masked
+        in one of them are masked in all outputs.
     n_outputs : int, optional
         Number of outputs.
 
@@ -91,7 +91,7 @@ def evaluate_blocks(function, *inputs, n_outputs=2):
         of numpy or of astropy if an input is one.
     """
     if all(isinstance(value, (float, int)) for value in inputs):
-        # One point, as in a loop over objects: without all that follows.
+        # A fast path for one point, as in a loop over objects.
         outputs = [np.empty(1) for _ in range(n_outputs)]
         function(*[np.array((value,), dtype=np.float64) for value in inputs], *outputs)
         return tuple([output.reshape(()) for output in outputs])
@@ -117,7 +117,7 @@ def evaluate_blocks(function, *inputs, n_outputs=2):
 
 
 def _evaluate_masked(function, inputs, n_outputs):
-    """Evaluate what is under the masks, too, and put the masks of all inputs on the outputs."""
+    """Evaluate masked elements, too, and apply the masks of all inputs to the outputs."""
     in_numpy = any(isinstance(value, np.ma.MaskedArray) for value in inputs)
     masks = [np.asarray(getattr(value, "mask", False)) for value in inputs]
     plain = [

@@ -1,4 +1,4 @@
-"""Piecewise bicubic maps on a grid of equal cells, summed up by cell."""
+"""Piecewise bicubic maps on a grid of equal cells."""
 
 import math
 
@@ -31,8 +31,8 @@ class CellGrid:
         outer | cells of the grid, numbered from 1 | outer
         s < 1 |          0 <= s < 1                | 0 <= s
 
-    Around them is a ring of outer cells without end, so that there are values everywhere.  Cells
-    are evaluated by `wpdc_gwcs.kernels`.
+    Around them is a ring of infinite outer cells, so that there are values everywhere.  Cells are
+    evaluated by `wpdc_gwcs.kernels`.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class CellGrid:
 
     @classmethod
     def continued(cls, x_range, y_range, coefficients, *, smooth):
-        """Return a grid that goes on outside its cells in straight lines.
+        """Return a grid that continues linearly outside its cells.
 
         Parameters
         ----------
@@ -71,12 +71,13 @@ class CellGrid:
         coefficients : (2, n, n, ny, nx) ndarray
             Coefficients of the cells, without the outer ring.
         smooth : bool
-            Whether the first derivatives are continuous from cell to cell; they are into the ring.
+            Whether the first derivatives are continuous from cell to cell.  Into the ring, they
+            always are.
 
         Returns
         -------
         grid : CellGrid
-            With values everywhere.
+            Grid with values everywhere.
         """
         along_x = _with_outer_cells(coefficients, power_axis=1, cell_axis=4)
         return cls(x_range, y_range, _with_outer_cells(along_x, 2, 3), smooth=smooth)
@@ -125,7 +126,7 @@ class CellGrid:
         return CellGrid(self.x_range, self.y_range, coefficients, smooth=self.smooth)
 
     def points(self, local):
-        """Return points at the same places in every cell.
+        """Return points at the same local coordinates in every cell.
 
         Parameters
         ----------
@@ -155,10 +156,10 @@ class CellGrid:
         function : callable
             ``function(x, y) -> a, b`` of 1-D arrays; smooth in each cell.
         """
-        # At Chebyshev's points the interpolant is nearly the best there is.
+        # At Chebyshev points, the interpolant is nearly the best approximation.
         local = 0.5 - 0.5 * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)
         values = np.reshape(function(*self.points(local)), (2, self.ny, 4, self.nx, 4))
-        # The powers amplify rounding: of differences within the cell, not of the values.
+        # Powers amplify rounding errors, so they are used for differences within the cell only.
         first = values[:, :, :1, :, :1].copy()
         powers = np.linalg.inv(np.vander(local, increasing=True))
         coefficients = np.einsum(

@@ -30,7 +30,7 @@ class DistortionCorrection(Model):
     crpix : (float, float)
         Reference point in zero-based pixels, (x, y).
     cd : (2, 2) array_like
-        The matrix in which the PV polynomial stands, degrees per pixel.
+        Matrix used by the PV polynomial, degrees per pixel.
     pv : PVPolynomial, optional
         The polynomial; the identity by default.
     lookup_table : LookupTable, optional
@@ -51,11 +51,11 @@ class DistortionCorrection(Model):
 
         X' = CD^-1 PV(CD (x - CRPIX)) + CRPIX - table(x)
 
-    This is ``pv_chain - lookup_table`` of ordinary model arithmetic (`composed` returns it),
-    evaluated in one pass: in each cell of the table the whole of it is one bicubic polynomial.
-    `DetectorToSky` takes the tangent plane into the same pass.
+    This is ``pv_chain - lookup_table`` in ordinary model arithmetic (see `composed`), evaluated in
+    one pass: in each cell of the table, the sum is a single bicubic polynomial.  `DetectorToSky`
+    includes the tangent plane in the same pass.
 
-    It is defined everywhere; outside its nodes the table is continued linearly.
+    The model is defined everywhere, because the table is continued linearly outside its nodes.
 
     Examples
     --------
@@ -105,7 +105,7 @@ class DistortionCorrection(Model):
         self.outputs = ("x_undistorted", "y_undistorted")
 
     def __getstate__(self):
-        # The folded coefficients are worked out again where they are needed.
+        # The folded coefficients are computed again when they are needed.
         return {**self.__dict__, "_cache": None}
 
     def __repr__(self):
@@ -127,7 +127,7 @@ class DistortionCorrection(Model):
 
     @property
     def composed(self):
-        """The same as a compound of simple parts, ``pv_chain - lookup_table``: plain but slow."""
+        """The same transform as a compound of simple models, which is slow to evaluate."""
         from astropy.modeling.models import AffineTransformation2D, Identity
 
         matrix, crpix = self.cd.value, self.crpix.value
@@ -223,8 +223,8 @@ class DistortionCorrection(Model):
 class DistortionInverse(Model):
     """Undistorted to detector pixels: the inverse of `DistortionCorrection`, by Newton's method.
 
-    Every answer has been verified by its residual, or a bound of it (1e-9 px).  NaN where there is
-    none.
+    Every solution is verified by its residual or an upper limit of it (1e-9 px); it is NaN if there
+    is none.
 
     Parameters
     ----------
@@ -269,7 +269,7 @@ class DistortionInverse(Model):
         Returns
         -------
         x, y : ndarray
-            Detector pixel coordinates, zero based; NaN where there is no answer.
+            Detector pixel coordinates, zero based; NaN where there is no solution.
         """
         invert = self.distortion._plane_map().inverse(tolerance=TOLERANCE_PX)
         return evaluate_blocks(invert, x, y)
@@ -283,8 +283,8 @@ class DistortionInverse(Model):
 class DetectorToSky(Model):
     """Detector pixels to the sky in one pass: ``distortion | sky``, to 1e-7 px.
 
-    If there is a look-up table, the projection is included in its cells if it is bicubic there to
-    1e-7 px, which it is except near the poles.  Otherwise the formulas are evaluated.
+    If there is a look-up table, the projection is included in its cells, provided that it is
+    bicubic there to 1e-7 px, as it is except near the poles.  Otherwise the formulas are evaluated.
 
     Parameters
     ----------
@@ -425,7 +425,7 @@ class SkyToDetector(Model):
         Returns
         -------
         x, y : ndarray
-            Detector pixel coordinates, zero based; NaN where there is no answer.
+            Detector pixel coordinates, zero based; NaN where there is no solution.
         """
         return evaluate_blocks(self.block_function(), ra, dec)
 

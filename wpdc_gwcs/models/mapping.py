@@ -6,9 +6,9 @@
            --piecewise bicubic on a grid of cells---+
 
 A cubic polynomial is bicubic on each cell of a grid, so where there is a table the polynomial is
-folded into the table's cells and costs nothing.  Everything here takes contiguous float64 blocks
-and writes into others, as `wpdc_gwcs.models.blocks` hands them over; the loops over points are
-those of `wpdc_gwcs.kernels`.
+folded into the cells of the table and takes no additional time.  All functions take contiguous
+float64 blocks from `wpdc_gwcs.models.blocks` and write into others; the loops over points are those
+of `wpdc_gwcs.kernels`.
 """
 
 from functools import cached_property
@@ -27,12 +27,12 @@ RIM_PX = 1e-6
 #: Residual of the inverse in undistorted pixels; Newton's last step leaves far less.
 TOLERANCE_PX = 1e-9
 
-# The fit that the start of the inversion is made with: degree, and points along each axis.  It
-# leaves a few px of a distortion of 200 px.
+# Degree and points along each axis of the fit with which the start of the inversion is computed.
+# It leaves a few px of a distortion of 200 px.
 _FIT_DEGREE = 4
 _FIT_NODES = 17
 
-# The spline that starts the inversion: nodes along each axis, and the residual it is solved to.
+# Nodes along each axis of the spline that starts the inversion, and its residual.
 _SPLINE_NODES = 65
 _SPLINE_TOLERANCE = 1e-6
 
@@ -53,7 +53,7 @@ class PlaneMap:
     radial_matrix : (2, 2) ndarray, optional
         r is the length of ``radial_matrix @ (u, v)``.
     grid : CellGrid, optional
-        Added to the polynomial; it has values outside its cells, too.
+        Cells that are added to the polynomial; they have values outside their edges, too.
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class PlaneMap:
         Parameters
         ----------
         tolerance : float
-            Greatest residual of the map at the answer, in units of a and b.
+            Largest residual of the map at the solution, in units of a and b.
         tangent : (9,) ndarray, optional
             If given, positions on the sky are inverted, see `~wpdc_gwcs.kernels.tangent_numbers`.
         box : ((float, float), (float, float)), optional
@@ -212,7 +212,7 @@ class PlaneMap:
         a, b : (N,) ndarray
             Images to invert.
         tolerance : float
-            Greatest residual of the map at the answer, in units of a and b.
+            Largest residual of the map at the solution, in units of a and b.
 
         Returns
         -------
@@ -242,11 +242,11 @@ class PlaneMap:
 
     @cached_property
     def _start(self):
-        """Cells of an approximate inverse, where to start the inversion.
+        """Cells of an approximate inverse, as the start of the inversion.
 
-        A spline over the rectangle that the grid is mapped into, which leaves one step to do; it is
-        made with a polynomial fit.  `None`, the images themselves, where there is no grid and hence
-        no telling where a fit should hold.
+        They are a spline over the rectangle that the grid is mapped to, computed with a polynomial
+        fit; only one step remains.  Without a grid, the range of a fit is unknown, so this is
+        `None`, and the inversion starts from the images themselves.
         """
         grid = self.grid
         if grid is None:

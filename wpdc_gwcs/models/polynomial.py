@@ -31,7 +31,7 @@ class PVPolynomial(FittableModel):
     name : str, optional
         Name of the model.
     meta : dict, optional
-        Anything worth keeping with it.
+        Metadata of the model.
     **parameters : float or dict
         Coefficients ``pv1_0``, ``pv1_1``, ..., with FITS indices, and astropy's constraints
         (``fixed``, ``bounds``).  The default is the identity: ``pv1_1 = pv2_1 = 1``, all others 0.
@@ -104,7 +104,7 @@ class PVPolynomial(FittableModel):
 
     @classmethod
     def from_coefficients(cls, coefficients, degree=3, radial=False, **kwargs):  # noqa: FBT002
-        """Make a polynomial of an array of coefficients.
+        """Make a polynomial from an array of coefficients.
 
         Parameters
         ----------
@@ -251,9 +251,9 @@ class PVPolynomial(FittableModel):
 
 
 class PVInverse(Model):
-    """The inverse of a `PVPolynomial`, solved to rounding by Newton's method.
+    """The inverse of a `PVPolynomial`, accurate to rounding, by Newton's method.
 
-    NaN where the iteration finds no answer whose residual vanishes.
+    The result is NaN if the iteration finds no solution with a vanishing residual.
 
     Parameters
     ----------

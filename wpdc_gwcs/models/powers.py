@@ -74,13 +74,13 @@ def fit_polynomial(points, values, degree, weights=None):
     Returns
     -------
     polynomial : (2, degree + 1, degree + 1) ndarray
-        ``polynomial[k, p, q]`` multiplies ``u**p v**q`` in output k, (u, v) being the point minus
-        origin.
+        ``polynomial[k, p, q]`` multiplies ``u**p v**q`` in output k, where (u, v) is the point
+        minus the origin.
     origin : (float, float)
         Center of the points.
     """
     origin = tuple(0.5 * (point.min() + point.max()) for point in points)
-    # Scaled for the solution, not for its use: floating-point powers lose nothing.
+    # Scaled for the solution only: later, floating-point powers lose no accuracy.
     scale = 0.5 * max(np.ptp(point) for point in points)
     u, v = ((point - center) / scale for point, center in zip(points, origin, strict=True))
     powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p)]
@@ -130,7 +130,7 @@ def derivative(coefficients, axis):
     coefficients : (n, n) ndarray
         ``coefficients[p, q]`` multiplies ``u**p v**q``.
     axis : int
-        0 for the derivative by u, 1 for that by v.
+        0 for the derivative with respect to u, 1 for that with respect to v.
 
     Returns
     -------

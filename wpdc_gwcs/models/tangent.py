@@ -80,7 +80,7 @@ def deproject(xi, eta, crval):
         tan(ra - ra0) = xi / (cos dec0 - eta sin dec0)
         tan(dec) = (sin dec0 + eta cos dec0) / hypot(xi, cos dec0 - eta sin dec0)
 
-    which is exact at the poles, too.
+    which are exact at the poles, too.
 
     Examples
     --------
@@ -106,7 +106,7 @@ def _check_linear(crpix, cd, crval):
 
 
 def check_invertible(label, matrix):
-    """Raise an error unless a 2 x 2 matrix can be inverted without losing all digits.
+    """Raise an error unless a 2 x 2 matrix has an accurate inverse.
 
     Parameters
     ----------
@@ -165,12 +165,13 @@ class TangentSky(_Linear):
     Raises
     ------
     ValueError
-        If a shape is wrong, a number is not finite or ``cd`` is singular.
+        If a shape is wrong, a number is not finite, ``cd`` is singular, or the declination is not
+        between -90 and 90.
 
     Notes
     -----
-    The native pole stands at LONPOLE = 180 deg at every declination.  (FITS makes 0 the default at
-    a declination of exactly +90 deg; such a header has to be turned by half a circle.)
+    LONPOLE is 180 deg at every declination.  (In FITS, its default at a declination of exactly
+    +90 deg is 0; such a header has to be rotated by 180 deg.)
 
     Examples
     --------
@@ -204,9 +205,9 @@ class TangentSky(_Linear):
         return evaluate_blocks(_deprojection(crval, cd, crpix), x, y)
 
     def _after(self, plane_map):
-        """Return the whole way to the sky, a `_SkyMap`.
+        """Return the complete map to the sky, a `_SkyMap`.
 
-        It is kept for as long as it is asked for with the same map and the same parameters.
+        It is cached for requests with the same map and the same parameters.
         """
         crpix, cd, crval = self.crpix.value, self.cd.value, self.crval.value
         key = (crpix.tobytes(), cd.tobytes(), crval.tobytes())
@@ -230,9 +231,10 @@ _MOST_CELLS = 40_000
 
 
 class _SkyMap:
-    """The whole way to the sky and back, on blocks: a map of the plane, the sphere behind it.
+    """The complete map to the sky and back, on blocks: a map of the plane, then the projection.
 
-    Where cells lead to the sky itself as well as that, they are used for what lies inside them.
+    If there are cells that map to the sky itself with sufficient accuracy, they are used for the
+    points inside them.
     """
 
     def __init__(self, plane_map, crpix, cd, crval):
@@ -287,18 +289,18 @@ class _SkyMap:
 
 
 def _cells_to_sky(to_plane, tangent, scale):
-    """Return cells of a map with the tangent plane taken into them, or `None`.
+    """Return the cells of a map with the projection included, or `None`.
 
-    In a cell of a look-up table the sky is so nearly a plane that the projection, too, is bicubic
-    to some 1e-8 px, and as quick to evaluate as the table alone.  It is not where cells are large
-    or a pole is close; `None` then.
+    In a cell of a look-up table, the sky is so flat that the projection is bicubic, too, to about
+    1e-8 px.  It then takes no additional time.  If cells are large or a pole is close, this is not
+    the case, and `None` is returned.
     """
     grid = to_plane.grid
     if grid is None or to_plane.polynomial is not None or grid.nx * grid.ny > _MOST_CELLS:
         return None
 
     plane = to_plane.plane
-    # About a right ascension of 180 degrees, where none of them begins anew.
+    # About a right ascension of 180 degrees, so that none of them wraps.
     middle = tangent.copy()
     middle[0] = 180.0
 
@@ -321,7 +323,7 @@ def _cells_to_sky(to_plane, tangent, scale):
 class SkyTangent(_Linear):
     """The sky to undistorted pixels: the inverse of `TangentSky`, with the same parameters.
 
-    NaN for points 90 degrees or more from the tangent point.
+    The result is NaN for points 90 degrees or more from the tangent point.
 
     Parameters
     ----------
