@@ -33,7 +33,12 @@ class ResidualMap:
     sums : (K, 14, my, mx) ndarray, optional
         Sums of an existing map, in the order of `ResidualMap.columns`.  Default: an empty map.
     shape : (int, int), optional
-        Bins ``(my, mx)``.  Default: about 72 along the longer side, in multiples of 12.
+        Bins ``(my, mx)``.  Default: 72 along the longer side, and a multiple of 12 along the other.
+
+    Raises
+    ------
+    ValueError
+        If a shape is invalid.
 
     Notes
     -----
@@ -236,7 +241,7 @@ class ResidualMap:
         return coarse
 
     def displaced(self, dx, dy):
-        """Add a displacement of every bin to the residuals in it.
+        """Add a displacement to the residuals of each bin.
 
         Parameters
         ----------
@@ -246,7 +251,7 @@ class ResidualMap:
         Returns
         -------
         ResidualMap
-            As if all stars of a bin had residuals larger by that.
+            Map in which the residuals of all stars of a bin are increased by its displacement.
         """
         dx, dy = np.asarray(dx, float), np.asarray(dy, float)
         sums = self.sums.copy()
@@ -259,84 +264,84 @@ class ResidualMap:
         return ResidualMap(self.image_shape, sums)
 
     def weighted(self, factor):
-        """Let the residuals count for less, or more.
+        """Return the map with other weights of the residuals.
 
         Parameters
         ----------
         factor : float
-            Multiplies all weights, and divides the variances of all means; positive.
+            Positive factor that multiplies all weights and divides the variances of all means.
 
         Returns
         -------
         ResidualMap
-            With the same number of stars.
+            Map with the same numbers of stars.
         """
         sums = self.sums.copy()
         sums[:, 1:] *= factor
         return ResidualMap(self.image_shape, sums)
 
     def without(self, fold):
-        """Leave one group out, for cross-validation.
+        """Return the map without one group, for cross-validation.
 
         Parameters
         ----------
         fold : int
-            Group left out.
+            Group that is left out.
 
         Returns
         -------
         ResidualMap
-            Of the other groups.
+            Map of the other groups.
         """
         sums = self.sums.copy()
         sums[fold] = 0.0
         return ResidualMap(self.image_shape, sums)
 
     def only(self, fold):
-        """Keep one group alone.
+        """Return the map of a single group.
 
         Parameters
         ----------
         fold : int
-            Group kept.
+            Group that is kept.
 
         Returns
         -------
         ResidualMap
-            Of that group.
+            Map of that group.
         """
         sums = np.zeros_like(self.sums)
         sums[fold] = self.sums[fold]
         return ResidualMap(self.image_shape, sums)
 
     def to_tree(self):
-        """Plain dictionary of numbers and arrays, for files.
+        """Convert the map to a plain dictionary of numbers and arrays, for files.
 
         Returns
         -------
         dict
-            Accepted by `from_tree`.
+            Dictionary for `from_tree`.
         """
         return {"image_shape": list(self.image_shape), "columns": list(_SUMS), "sums": self.sums}
 
     @classmethod
     def from_tree(cls, tree):
-        """Inverse of `to_tree`.
+        """Build a map from the dictionary of `to_tree`.
 
         Parameters
         ----------
         tree : dict
-            As given by `to_tree`.
+            As returned by `to_tree`.
 
         Returns
         -------
         ResidualMap
-            Equal to the one written.
+            Map equal to the original one.
 
         Raises
         ------
         ValueError
-            If the tree is of another layout.
+            If the dictionary has another layout.
         """
         if list(tree["columns"]) != list(_SUMS):
             raise ValueError(f"columns of the residual map must be {_SUMS}, got {tree['columns']}")

@@ -110,8 +110,8 @@ def solve(
         Whether to add the residuals of these exposures to those of ``solution`` and make a new
         table.
     pool_attitudes : bool, optional
-        Estimate from five or more exposures how much scale, rotation and skew vary between them,
-        and draw those of each exposure toward their mean accordingly.
+        Whether to estimate from five or more exposures how much scale, rotation and skew vary
+        between them, and to shrink those of each exposure toward their mean accordingly.
     clip : float, optional
         Pairs with residuals of more than this many robust standard deviations are left out.
     table_choice : dict, optional
@@ -138,7 +138,11 @@ def solve(
     The residual of a pair is a sum of linear terms (`wpdc_gwcs.solve.terms`), each with a Gaussian
     prior whose variance is learned:
 
-    .. math:: r = \Phi(x) w + O(\varphi) o + B(\varphi) a_e + \delta_e(\varphi) + noise
+    .. math:: r = \Phi(x) w + O(\varphi) o + B(\varphi) a_e + \delta_e(\varphi) + \text{noise}
+
+    Here x is the position on the detector and :math:`\varphi` that in the focal plane; w are the
+    coefficients of the detector, o those of the optics, :math:`a_e` the six linear numbers of the
+    exposure e, and :math:`\delta_e` is its field.
 
     1. All terms except the fields are solved together, with the variance of every degree.
        Outliers are judged by the prediction from the other stars.

@@ -27,7 +27,7 @@ _ALIEN_RATIO, _ALIEN_SCATTER, _LINEAR_TERMS = 10.0, 50.0, 6
 
 
 def without_aliens(o, state):
-    """Leave out frames whose pairs no linear map brings into agreement with those of other frames.
+    """Leave out frames whose pairs no linear map can reconcile with those of other frames.
 
     Such a frame would spoil the polynomial for all.
 
@@ -41,12 +41,12 @@ def without_aliens(o, state):
     Returns
     -------
     State
-        With the reasons of the frames left out.
+        State with the reasons for the frames that were left out.
 
     Raises
     ------
     FitError
-        If none is left.
+        If no frame is left.
     """
     residual = all_residuals(o, state)
     reasons, scatter = list(state.reason), {}
@@ -86,12 +86,12 @@ def without_wrong(o, state):
     Returns
     -------
     State
-        With the reasons of the frames left out.
+        State with the reasons for the frames that were left out.
 
     Raises
     ------
     FitError
-        If none is left.
+        If no frame is left.
     """
     residual = all_residuals(o, state)
     scatter = {}
