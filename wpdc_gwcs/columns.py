@@ -1,8 +1,8 @@
 """Reading of table columns: names, masked and missing values, units, numbers as text.
 
 Tables of stars have many sources: a missing value may be masked, NaN, empty, ``null`` or ``--``, a
-unit may be misspelled, a number may be in a column of text.  All parts of the package read columns
-here.
+unit may be misspelled, and a number may be in a column of text.  All parts of the package read
+columns with these functions.
 """
 
 import re

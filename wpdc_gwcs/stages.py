@@ -33,7 +33,7 @@ def listening(listener):
     Yields
     ------
     None
-        Nothing.
+        No value.
     """
     token = _listener.set(listener)
     try:

@@ -18,7 +18,7 @@ one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
 def count_threads():
-    """Count the threads that work goes to: one for each processor at hand, up to four.
+    """Return the number of threads to use: one for each available processor, up to four.
 
     Returns
     -------
@@ -33,7 +33,7 @@ def count_threads():
 
 
 def share_processors(n_processes):
-    """Take no more than its share of the processors in this process.
+    """Limit this process to its share of the processors.
 
     Parameters
     ----------
@@ -50,9 +50,10 @@ def map_threads(function, items):
     Parameters
     ----------
     function : callable
-        Of one item; worth it where nearly all of its time goes to linear algebra and large arrays.
+        Function of one item.  Threads save time if it consists mostly of linear algebra and
+        operations on large arrays.
     items : iterable
-        Independent of each other.
+        The items, which are independent of each other.
 
     Returns
     -------

@@ -203,7 +203,7 @@ def _match_all(new, catalog, settings):
 
 
 def _can_be_tried(result):
-    """Frames without sources, or with the wrong stored solution, failed for other reasons."""
+    """Return whether a failed frame can be tried again: it was measured, but not matched."""
     return result.sources is not None and isinstance(result.error, MatchError)
 
 

@@ -1,4 +1,4 @@
-"""Figures of the page, in small files."""
+"""Figures of the page, as small files."""
 
 import base64
 import io
@@ -9,9 +9,9 @@ from wpdc_gwcs import plotting
 
 __all__ = ["detector_figures", "frame_figures"]
 
-# Dots per inch and colors of figures, which have few and their shades, and stars that are drawn one
-# by one: of a detector, of its color maps, in which fewer shades would show false hues, and of what
-# there may be many of.
+# Dots per inch and number of colors of the figures of a detector, of its color maps, which need
+# more shades, and of figures that may be numerous; and the maximum number of stars drawn one by
+# one.
 _LARGE = {"dpi": 80, "colors": 64}
 _MAPS = {"dpi": 80, "colors": 256}
 _SMALL = {"dpi": 62, "colors": 16}
@@ -30,12 +30,12 @@ def detector_figures(name, solution, table, *, small=False):
     table : `~astropy.table.Table` or None
         Matches of all frames.
     small : bool, optional
-        Only the first figure, and a small file: there are many detectors.
+        Whether to draw only the first figure, as a small file, because there are many detectors.
 
     Returns
     -------
     list of dict
-        With ``alt``, ``caption``, ``width``, ``height`` and ``data``.
+        Figures, each with ``alt``, ``caption``, ``width``, ``height`` and ``data``.
     """
     figures = []
     if table is not None and len(table):
@@ -104,7 +104,7 @@ def frame_figures(name, table):
     Returns
     -------
     list of dict
-        With ``alt``, ``caption``, ``width``, ``height`` and ``data``.
+        Figures, each with ``alt``, ``caption``, ``width``, ``height`` and ``data``.
     """
     shown, caption = table, None
     if len(table) > _MOST_STARS_SMALL:

@@ -1,4 +1,4 @@
-"""What stands on the page: pooled detectors, frames, settings."""
+"""Content of the page: pooled detectors, frames, settings."""
 
 from collections import Counter
 
@@ -12,7 +12,7 @@ from wpdc_gwcs.report.template import PAGE
 
 __all__ = ["write_report"]
 
-# Columns of the summary that are seen at once, and how they are called there.
+# Columns of the summary that are visible at once, and their headings.
 _IMPORTANT = {
     "frame": ("frame", None),
     "detector": ("detector", None),
@@ -46,14 +46,14 @@ _DETECTOR = (
     *(_STATISTICS[n] for n in list(_STATISTICS)[:5]),
     ("held out dx", "sigma, px"), ("held out dy", "sigma, px"), ("rms", "mas"),
 )  # fmt: skip
-# Detectors with all their figures; of more, each has the most important one.
+# Maximum number of detectors with all figures; if there are more, each has the most important one.
 _FEW_DETECTORS = 6
-# Frames of a detector that are pooled, frames with figures, and rows of a table: of more, which no
-# page can hold, those that are worth a look.
+# Maximum number of pooled frames of a detector, of frames with figures, and of rows in a table; of
+# more frames, which do not fit on a page, the most interesting ones are shown.
 _MOST_POOLED, _MOST_FIGURES, _MOST_ROWS = 100, 100, 500
-# Characters of a column before its texts are broken.
+# Number of characters in a column above which its texts are wrapped.
 _WIDEST = 34
-# Reasons that fit at the beginning of a page.
+# Maximum number of reasons at the beginning of the page.
 _MOST_PROBLEMS = 30
 _POOLED = ("x", "y", "dx", "dy", "used", "holdout", "phot_g_mean_mag", "snr")
 
@@ -73,20 +73,20 @@ def write_report(summary, solutions, matches, file, *, title="Calibration report
         frames that were solved or degraded.  Tables are requested when they are needed and not
         kept, so they can be read then.
     file : text file object
-        Where the page goes.
+        File to which the page is written.
     title : str, optional
         Heading of the page.
     about : dict, optional
         Description of the run, headings to names and values, such as
-        ``{"settings": {"degree": "auto"}}``; the settings of the solutions if not given.
+        ``{"settings": {"degree": "auto"}}``.  Default: the settings of the solutions.
 
     Notes
     -----
     The page contains everything, so it can be sent by mail and opened without a network.  The
-    sections of the frames are collapsed.  72 frames need less than 3 MB, for one detector or for
-    72.  For a survey, 100 frames of each detector, chosen evenly, are pooled.  The tables have the
-    500 frames that failed, are degraded or have the largest residuals, and the worst 100 of them
-    have figures.
+    sections of the frames are collapsed.  A page of 72 frames, of one detector or of 72, needs less
+    than 3 MB.  For a survey, 100 evenly chosen frames of each detector are pooled.  The tables have
+    at most 500 frames: those that failed, are degraded or have the largest residuals.  The worst
+    100 of them have figures.
 
     Examples
     --------
@@ -144,7 +144,7 @@ def write_report(summary, solutions, matches, file, *, title="Calibration report
                     "id": ids[name],
                     "title": name,
                     "table": _frame_table(matches[name]),
-                    # What is shown of a detector is all that there is of its only frame.
+                    # The figures of a detector with a single frame already show this frame.
                     "figures": frame_figures(name, matches[name])
                     if alone[frames[name]] > 1 or frames[name] not in solutions
                     else [],
@@ -164,7 +164,7 @@ def _evenly(names, most):
 
 
 def _worst_first(summary, most):
-    """Rows of a summary as they are; of too many, failed and degraded ones and large residuals."""
+    """Rows of a summary; if there are too many, those that failed, are degraded, or are worst."""
     if len(summary) <= most:
         return summary
     rank = {"failed": 0, "degraded": 1}
@@ -293,7 +293,7 @@ def _every_column(summary):
 
 
 def _without_empty(table):
-    """Leave out columns in which no row has anything: nothing was held out, nothing has failed."""
+    """Leave out empty columns, for example if nothing was held out and no frame failed."""
     kept = [
         k
         for k in range(len(table["columns"]))
@@ -310,7 +310,7 @@ def _without_empty(table):
 
 
 def _width(table, k):
-    """Least width of a column of texts, in characters: names are whole, sentences are broken."""
+    """Minimum width of a column of texts, in characters: only sentences are wrapped."""
     cells = [table["columns"][k]["name"], *(row["cells"][k] for row in table["rows"])]
     return min(max(map(len, cells)) + 1, _WIDEST)
 
@@ -326,7 +326,7 @@ def _frame_table(table):
 
 
 def _describe(solution, table):
-    """Say in a few words what the solution of a detector is."""
+    """Describe the solution of a detector in a few words."""
     if solution is None:
         return "No solution is stored for it."
     ny, nx = solution.image_shape

@@ -1,4 +1,4 @@
-"""The template of the page: one file, without anything from elsewhere."""
+"""The template of the page, a single file without external resources."""
 
 __all__ = ["PAGE"]
 
