@@ -51,8 +51,12 @@ class MatchedFrame:
 
     Parameters
     ----------
-    name, source, detector, image_shape, wcs, exposure, camera, epoch
+    name, source, detector : str
         As in `~wpdc_gwcs.frame.Frame`.
+    image_shape : (int, int)
+        Shape ``(ny, nx)`` in px.
+    wcs : object
+        Starting WCS of the frame.
     sources : `~astropy.table.Table`
         Measured sources.
     usable : (N,) ndarray of bool
@@ -69,6 +73,10 @@ class MatchedFrame:
         Whether the sources were measured on an image.
     seconds : float
         Time that measuring and matching took, s.
+    exposure, camera : str, optional
+        As in `~wpdc_gwcs.frame.Frame`.
+    epoch : float, optional
+        Epoch of the frame, Julian years.
     left_out : str, optional
         Numbers of sources that each rule excludes, in words.
 
