@@ -89,8 +89,8 @@ def make_form(obj, form, *, degree=None, versions: Mapping = MappingProxyType({}
         The form.
     degree : int, optional
         Degree of the polynomials.  Default: that of the solution for ``fits`` and ``cpdis``; for
-        ``tpv``, ``head`` and ``sip``, the lowest degree that is accurate to 1e-3 px or nearly as
-        accurate as any.
+        the others, the lowest degree that is accurate to 1e-3 px (``tpv``, ``head``) or 1e-4 px
+        (``sip``), or nearly as accurate as any.
     versions : mapping of str to int, optional
         EXTVER of the first table of each EXTNAME, for files that already have such tables.
 

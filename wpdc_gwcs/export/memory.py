@@ -25,8 +25,8 @@ class InMemory:
             TPV polynomials, for SWarp, SCAMP, GalSim and astropy, or SIP polynomials, for DS9 and
             other viewers.  Both are fitted to the whole mapping, including the look-up table.
         degree : int, optional
-            Degree of the polynomials.  Default: the lowest one that is accurate to 1e-3 px or
-            nearly as good as any other.
+            Degree of the polynomials.  Default: the lowest one that is accurate to 1e-3 px
+            (``tpv``) or 1e-4 px (``sip``), or nearly as accurate as any other.
 
         Returns
         -------

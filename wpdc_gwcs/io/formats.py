@@ -33,8 +33,8 @@ def read(path):
     Returns
     -------
     obj : `~wpdc_gwcs.Calibration`, `~wpdc_gwcs.DistortionSolution` or `~wpdc_gwcs.Camera`
-        With the fast, exactly invertible ``wcs``; a camera includes the solutions of its detectors,
-        whose files must be at the paths that it names.
+        Object with a fast, exactly invertible ``wcs``.  A camera includes the solutions of its
+        detectors, whose files must be at the paths that it names.
 
     Raises
     ------
@@ -146,16 +146,16 @@ def write(obj, path, *, format=None, degree=None, overwrite=False):
     Parameters
     ----------
     obj : Calibration, DistortionSolution, Camera or `~astropy.table.Table`
-        Object to write; FITS formats have a solution at its nominal pointing.  A camera is written
-        as ``asdf`` only.
+        Object to write.  In FITS formats, a solution has its nominal pointing.  A camera can only
+        be written as ``asdf``.
     path : path-like
         File to write.
     format : {"asdf", "fits", "cpdis", "tpv", "head", "sip", "tab", "stock"}, optional
         By default from the suffix: ``.asdf``, ``.fits``, ``.head``; ``.ecsv`` for tables.
     degree : int, optional
-        Degree of the polynomials of the FITS formats; by default that of the solution for ``fits``
-        and ``cpdis``, for the others the lowest that is accurate to 1e-3 px, or
-        nearly as accurate as any.
+        Degree of the polynomials of the FITS formats.  Default: that of the solution for ``fits``
+        and ``cpdis``; for the others, the lowest that is accurate to 1e-3 px (``tpv``, ``head``) or
+        1e-4 px (``sip``), or nearly as accurate as any.
     overwrite : bool, optional
         Whether an existing file may be replaced.
 
