@@ -54,10 +54,11 @@ __all__ = ["CalibrationRun", "calibrate"]
 
 log = logging.getLogger(__name__)
 
-# Models and their parameters refer to each other.  Their tables, a megabyte for a frame, would wait
-# for a search for cycles, which a few large objects never set off; it takes the time of one frame.
+# Number of frames between searches for reference cycles, each of which takes the time of one frame.
+# Models and their parameters refer to each other.  Without a search, their tables, a megabyte for a
+# frame, would stay in memory, because a few large objects never trigger one.
 _FRAMES_PER_SEARCH = 100
-# Frames that may wait for their solutions by workers, about a megabyte each.
+# Maximum number of frames that wait for their solutions by workers, about a megabyte each.
 _MOST_SOLVING = 1000
 
 
@@ -243,11 +244,11 @@ def calibrate(
         say(tell_frames, frames, groups)
         catalog = catalog_source(catalog, max_mag=settings.max_mag)
         path = catalog if isinstance(catalog, str | os.PathLike) else None
-        # Before the catalog, which may take a while.
+        # Before the catalog is read, which may take a while.
         if folder is not None:
             folder.check(groups, inputs=[] if path is None else [split_extension(path)[0]])
         if not hasattr(catalog, "stars_of"):
-            # What is in memory is there as a whole; of a file all that the run needs, once.
+            # A table in memory is used as a whole; of a file, the part for the run is read once.
             region = None if path is None else sky_of_frames(frames, settings, solution)
             began = time.perf_counter()
             catalog = fill_motions(read_catalog(catalog, region=region))
@@ -264,7 +265,7 @@ def calibrate(
                 update=update,
             )
             run_id = folder.begin(groups, plan).run
-        # Of batches that depend on nothing else, workers make the files too.
+        # For batches that depend on nothing else, workers also make the files.
         remote = not keep and are_independent(settings, solution=solution, update=update)
         run = Run(frames, catalog, solution, settings, update, progress, run_id if remote else None)
         done = [group for group in groups if folder is not None and folder.is_done(group)]
@@ -285,7 +286,7 @@ def calibrate(
                         "files: results of %s written to %s (%.1f s)",
                         counted(len(group), "frame"), output, time.perf_counter() - began,
                     )  # fmt: skip
-                # Its tables are not to wait for the next one.
+                # This frees its tables before the next outcome.
                 del outcome
     resumed = tuple(frame.name for group in done for frame in group)
     return _joined(frames, list(outcomes.values()), run_id, resumed)
@@ -377,7 +378,7 @@ def _batch_of(work, results, run, workers):
             results = match_group(work, results, run, workers)
         except ClusterError:
             raise
-        except Exception as error:  # noqa: BLE001  One camera is not to end the run of all.
+        except Exception as error:  # noqa: BLE001  One camera must not end the whole run.
             problem = error
     return Batch(
         group,
@@ -422,7 +423,7 @@ class _Solving:
 
 
 def _too_many(solving, workers):
-    """Whether as many batches are being solved as keep the workers busy, or the memory holds."""
+    """Whether enough batches are being solved to keep the workers busy or to fill the memory."""
     n_frames = sum(len(one.batch.frames) for one in solving)
     return len(solving) > workers.in_hand or n_frames > _MOST_SOLVING
 

@@ -86,7 +86,7 @@ def solve_or_fail(batch):
         if batch.problem is not None:
             raise batch.problem
         outcome = _solve(batch)
-    except Exception as problem:  # noqa: BLE001  One camera is not to end the run of all.
+    except Exception as problem:  # noqa: BLE001  One camera must not end the whole run.
         error = problem if isinstance(problem, WPDCError) else internal_error(problem)
         without_frames(error)
         return Outcome(

@@ -38,7 +38,7 @@ FRAME_SUFFIXES = (".sources.ecsv", ".matches.ecsv", ".wcs.asdf")
 SUMMARY, MANIFEST = "summary.ecsv", "manifest.json"
 #: File of a set that names those that are to go.
 REMOVED = "removed.json"
-# Hidden folders of our own, not those of others.
+# Names of the hidden folders of this package.
 _STAGED = re.compile(r"\.[0-9a-f]{12}\.(part|done)")
 
 
@@ -53,8 +53,8 @@ def lock(folder):
     Returns
     -------
     int or None
-        File descriptor whose end is that of the lock, whatever ends the program; `None` if the
-        file system has no locks.
+        File descriptor that holds the lock until it is closed, however the program ends; `None`
+        if the file system has no locks.
 
     Raises
     ------
@@ -78,12 +78,12 @@ def lock(folder):
 
 
 def clean(folder):
-    """Complete the sets that have begun to get their names, and remove those that have not.
+    """Complete interrupted sets that were being put in place, and remove incomplete ones.
 
     Parameters
     ----------
     folder : Path
-        A folder that is locked.
+        Folder with a lock.
     """
     for path in sorted(folder.iterdir()):
         if not (_STAGED.fullmatch(path.name) and path.is_dir()):
@@ -95,14 +95,14 @@ def clean(folder):
 
 
 def put_in_place(done, folder):
-    """Rename the files of a set to their final names, the WCS of a frame after its tables.
+    """Rename the files of a set to their final names; the WCS of a frame follows its tables.
 
     Parameters
     ----------
     done : Path
         Folder with the set, or the remaining files of it; it is removed.
     folder : Path
-        Where they go.
+        Result folder.
     """
     try:
         removed = json.loads((done / REMOVED).read_text(encoding="utf-8"))
@@ -111,14 +111,14 @@ def put_in_place(done, folder):
     for name in removed:
         (folder / name).unlink(missing_ok=True)
     journal = journal_of(folder, done.name.split(".")[1])
-    # By frame, so that its files come as one as nearly as can be.
+    # Frame by frame, so that the files of a frame appear at nearly the same time.
     for name in sorted(os.listdir(done), key=_order):
         if name == ENTRY:
             add_to_journal(done / name, journal)
         elif name != REMOVED:
             os.replace(done / name, folder / name)
             if name == MANIFEST:
-                # It has all that the journal had to say.
+                # The manifest has everything from the journal.
                 journal.unlink(missing_ok=True)
     shutil.rmtree(done)
 
@@ -127,5 +127,5 @@ def _order(name):
     for k, suffix in enumerate(FRAME_SUFFIXES):
         if name.endswith(suffix):
             return 0, name.removesuffix(suffix), k
-    # The manifest is the last: it says that the rest is there.
+    # The manifest is the last one, because it claims that the others exist.
     return {MANIFEST: 3, SUMMARY: 2, ENTRY: 2}.get(name, 1), name, 0

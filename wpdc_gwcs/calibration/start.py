@@ -75,12 +75,12 @@ class LinearWCS:
 
 
 def sky_of(wcs, x, y):
-    """Sky position of pixels through the shared low-level interface of a WCS.
+    """Return the sky positions of pixels through the shared low-level interface of a WCS.
 
     Parameters
     ----------
     wcs : object
-        With ``pixel_to_world_values``.
+        WCS with ``pixel_to_world_values``.
     x, y : (N,) array_like
         Pixel coordinates, zero based.
 
@@ -94,7 +94,7 @@ def sky_of(wcs, x, y):
 
 
 def detector_center(image_shape):
-    """Center of a detector.
+    """Return the center of a detector.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def detector_center(image_shape):
 
 
 def header_reference_point(frame):
-    """Find the reference point of the header, or the center where it is not on the detector.
+    """Return the reference point of the header, or the center if it is not on the detector.
 
     Parameters
     ----------
@@ -133,19 +133,19 @@ def header_reference_point(frame):
 
 
 def linear_wcs(wcs, crpix):
-    """Tangent-plane WCS that touches another one at a point: exact for TAN, local for any other.
+    """Build the tangent-plane WCS that agrees with another WCS at a point.
 
     Parameters
     ----------
     wcs : object
-        With ``pixel_to_world_values``.
+        WCS with ``pixel_to_world_values``.
     crpix : (2,) ndarray
         The point, px, zero based.
 
     Returns
     -------
     LinearWCS
-        With the same sky position, scale and orientation at the point.
+        WCS with the same sky position, scale and orientation at the point; it is exact for TAN.
     """
     crval, cd = local_plane(partial(sky_of, wcs), *crpix)
     return LinearWCS(crpix=crpix, cd=cd, crval=crval)

@@ -142,7 +142,7 @@ def match_or_fail(task):
         return replace(found, seconds=time.perf_counter() - began)
     except WPDCError as err:
         error = err
-    except Exception as problem:  # noqa: BLE001  One frame is not to end the run of all.
+    except Exception as problem:  # noqa: BLE001  One frame must not end the whole run.
         error = internal_error(problem)
     n_sources = 0 if sources is None else len(sources)
     # The sources may be the cause of an internal error.
