@@ -250,7 +250,7 @@ _LEFT_NEIGHBORS = 15
 
 
 def _left(stars, x, y):
-    """Square of what the polynomials leave, from the residuals of the nearest stars."""
+    """Square of the distortion that the polynomials leave, from the nearest residuals."""
     k = min(_LEFT_NEIGHBORS, stars.shape[1])
     _, near = cKDTree(stars[:2].T).query(np.stack([x, y], axis=1), k=k)
     mean = np.median(stars[2:, np.reshape(near, (-1, k))], axis=2)

@@ -57,6 +57,11 @@ def plot_before_after(
     (2, 5) ndarray of `matplotlib.axes.Axes`
         Before and after: the map; dx and dy against x; dx and dy against y.
 
+    Raises
+    ------
+    ValueError
+        If a column is missing, there is no table, or the number of axes is wrong.
+
     Examples
     --------
     >>> from wpdc_gwcs import calibrate, simulate

@@ -43,7 +43,7 @@ def plot_residuals_vs_magnitude(matches):
     Raises
     ------
     ValueError
-        If the table has none of these columns.
+        If the table has none of these columns, or no ``x``, ``y``, ``dx`` or ``dy``.
 
     Examples
     --------

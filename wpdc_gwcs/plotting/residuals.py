@@ -68,7 +68,8 @@ def plot_residuals_vs_position(matches):
     Parameters
     ----------
     matches : `~astropy.table.Table`
-        Matches with columns ``x``, ``y``, ``dx``, ``dy`` in px, ``used`` and ``holdout``.
+        Matches with columns ``x``, ``y``, ``dx``, ``dy`` in px, and optionally ``used`` and
+        ``holdout``.
 
     Returns
     -------
@@ -76,6 +77,11 @@ def plot_residuals_vs_position(matches):
         Four panels.  Stars of the fit and held-out stars differ in color; clipped stars are gray.
         The line is the running median of the stars of the fit and the held-out stars, and the band
         holds the middle 68 % of them.
+
+    Raises
+    ------
+    ValueError
+        If a column ``x``, ``y``, ``dx`` or ``dy`` is missing.
 
     Examples
     --------
@@ -138,7 +144,8 @@ def plot_residual_maps(matches, *, image_shape, n_bins=20):
     Parameters
     ----------
     matches : `~astropy.table.Table`
-        Matches with columns ``x``, ``y``, ``dx``, ``dy`` in px, ``used`` and ``holdout``.
+        Matches with columns ``x``, ``y``, ``dx``, ``dy`` in px, and optionally ``used`` and
+        ``holdout``.
     image_shape : (int, int)
         Shape of the detector, ``(ny, nx)``.
     n_bins : int, optional
@@ -148,6 +155,11 @@ def plot_residual_maps(matches, *, image_shape, n_bins=20):
     -------
     `matplotlib.figure.Figure`
         Three maps: dx, dy and stars per cell, of the stars of the fit and the held-out ones.
+
+    Raises
+    ------
+    ValueError
+        If a column ``x``, ``y``, ``dx`` or ``dy`` is missing.
 
     Examples
     --------
@@ -183,12 +195,18 @@ def plot_cdf(matches):
     Parameters
     ----------
     matches : `~astropy.table.Table`
-        Matches with columns ``x``, ``y``, ``dx``, ``dy`` in px, ``used`` and ``holdout``.
+        Matches with columns ``x``, ``y``, ``dx``, ``dy`` in px, and optionally ``used`` and
+        ``holdout``.
 
     Returns
     -------
     `matplotlib.figure.Figure`
         One panel with a curve for each axis; thin curves for the held-out stars.
+
+    Raises
+    ------
+    ValueError
+        If a column ``x``, ``y``, ``dx`` or ``dy`` is missing.
 
     Examples
     --------

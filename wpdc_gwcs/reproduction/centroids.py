@@ -40,7 +40,7 @@ def measure_against_truth(exposure):
     -------
     `~astropy.table.Table`
         One row for each clean source that is an isolated star: ``x``, ``y``, ``dx``, ``dy``
-        (measured less true), ``x_err``, ``y_err`` in px, ``snr`` and ``magnitude``.
+        (measured minus true), ``x_err``, ``y_err`` in px, ``snr`` and ``magnitude``.
     """
     sources = measure_sources(exposure.frame(image=True))
     sources = sources[np.asarray(sources["flags"]) == 0]

@@ -129,9 +129,10 @@ def solve(
     Raises
     ------
     FitError
-        If the pairs cannot determine the solution; the message has the numbers.
+        If there is no exposure, the pairs do not determine the solution, or the stored solution is
+        for a detector of another shape.
     ValueError
-        If an option has a wrong value.
+        If an option has a wrong value, or ``update`` is set without a stored solution.
 
     Notes
     -----
