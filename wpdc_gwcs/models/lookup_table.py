@@ -60,6 +60,10 @@ class LookupTable(Model):
     continued linearly with the value and the slope at its edge.  It is smooth there but has little
     meaning; the bounding box of a WCS masks positions off the detector.
 
+    References
+    ----------
+    WPDC-2P, arXiv:2603.09193, section 3.3.
+
     Examples
     --------
     >>> import numpy as np

@@ -182,8 +182,8 @@ class PlaneMap:
         Returns
         -------
         function : callable
-            ``function(a, b, x, y)`` writes the points x, y that have the images a, b, each verified
-            by its residual or a bound of it; NaN where there is none.
+            ``function(a, b, x, y)`` writes the points x, y with the images a, b.  Each is verified
+            by its residual or an upper limit of it; NaN if there is no solution.
 
         Notes
         -----

@@ -45,7 +45,7 @@ class PVPolynomial(FittableModel):
 
     Notes
     -----
-    At degree 3 (WPDC-2P, phase 1; two misprints of the paper corrected)::
+    At degree 3 (phase 1 of WPDC-2P, equation 1, with two misprints corrected)::
 
         xi'  = PV1_0 + PV1_1 xi + PV1_2 eta + PV1_4 xi^2 + PV1_5 xi eta + PV1_6 eta^2
                      + PV1_7 xi^3 + PV1_8 xi^2 eta + PV1_9 xi eta^2 + PV1_10 eta^3
@@ -56,7 +56,8 @@ class PVPolynomial(FittableModel):
 
     References
     ----------
-    The TPV World Coordinate System, https://fits.gsfc.nasa.gov/registry/tpvwcs/tpv.html
+    WPDC-2P, arXiv:2603.09193, equation 1; the TPV World Coordinate System,
+    https://fits.gsfc.nasa.gov/registry/tpvwcs/tpv.html
 
     Examples
     --------
