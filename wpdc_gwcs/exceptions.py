@@ -172,7 +172,7 @@ class MatchError(FrameFailure):
     message : str
         What is wrong.
     found : dict, optional
-        For a match that is further from the header than is allowed: ``shift`` (px), ``rotation``
+        For a match that is farther from the header than allowed: ``shift`` (px), ``rotation``
         (deg) and ``scale`` (factor) relative to the header.
 
     Examples

@@ -22,7 +22,7 @@ from wpdc_gwcs.wcs import build_wcs
 
 __all__ = ["Calibration", "DistortionSolution"]
 
-# No camera has a reference point further away than this, px.
+# No camera has a reference point farther away than this, px.
 FARTHEST_PX = 1e9
 # If the scales along its axes differ by more than this factor, a matrix has no useful inverse.
 _MOST_CONDITION = 1e6

@@ -64,7 +64,7 @@ def map_threads(function, items):
     n_threads = min(count_threads(), len(items))
     if n_threads < 2:
         return [function(item) for item in items]
-    # A pool of its own for each call: nothing outlives the call, so forked children and nested
-    # calls are safe.
+    # A separate pool for each call: nothing outlives the call, so forked children and nested calls
+    # are safe.
     with ThreadPoolExecutor(n_threads) as pool:
         return list(pool.map(function, items))

@@ -69,7 +69,7 @@ def cluster_executor(address, timeout):
             "--scheduler needs Dask, which is not installed: pip install 'wpdc_gwcs[dask]'"
         ) from err
     # Messages of Dask about lost connections are suppressed; the outcome is reported here.
-    # Its configuration gives the second logger a level of its own.
+    # Its configuration sets a separate level for the second logger.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     began = time.monotonic()

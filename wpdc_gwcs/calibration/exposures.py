@@ -71,7 +71,7 @@ def tie_exposures(frames):
 
 
 def _by_start(frames, rows):
-    """Split frames where the times at which they began have a gap."""
+    """Split frames at gaps between their start times."""
     starts = [frames[row].meta.get("start") for row in rows]
     if any(start is None for start in starts):
         return [rows]
@@ -81,7 +81,7 @@ def _by_start(frames, rows):
 
 
 def _by_place(frames, rows):
-    """Split frames whose headers point further apart than a camera is large."""
+    """Split frames whose headers point farther apart than the size of a camera."""
     places, sizes = zip(*(_place(frames[row]) for row in rows), strict=True)
     places = np.array(places)
     if not np.isfinite(places).all():
@@ -101,7 +101,7 @@ def _by_place(frames, rows):
 
 
 def _place(frame):
-    """Direction of the center of a frame by its header, and its diagonal in radians."""
+    """Direction of the center of a frame from its header, and its diagonal in radians."""
     ny, nx = frame.image_shape
     center = detector_center(frame.image_shape)
     x, y = center[0] + np.array([0.0, 0.5, 0.0]), center[1] + np.array([0.0, 0.0, 0.5])

@@ -63,9 +63,9 @@ def select_stars(stars, snr, quality, fwhm, shape, *, n_max, min_snr):
     shape : (int, int)
         Shape of the image.
     n_max : int
-        Greatest number of stars.
+        Maximum number of stars.
     min_snr : float
-        Least signal-to-noise ratio.
+        Minimum signal-to-noise ratio.
 
     Returns
     -------

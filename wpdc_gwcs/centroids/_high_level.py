@@ -51,9 +51,9 @@ def build_epsf(data, sources, *, gain=None, error=None, n_max=800, min_snr=30.0,
     error : float or (ny, nx) array_like, optional
         Standard deviation of the background; only for a plain array.
     n_max : int, optional
-        Greatest number of stars used.
+        Maximum number of stars used.
     min_snr : float, optional
-        Least signal-to-noise ratio of a star used.
+        Minimum signal-to-noise ratio of the stars used.
     vary : {"auto", "never"}, optional
         ``auto`` lets the PSF vary over the detector if it then describes left-out stars better.
 

@@ -165,7 +165,7 @@ class Profile:
         return Models(*numbers, half, center, flux)
 
     def _numbers(self, dx, dy, shares):
-        """Grids, oversampling, phases and shares as kernels take them."""
+        """Grids, oversampling, phases and shares for the kernels."""
         n = len(dx)
         position = np.concatenate([dx, dy]) * -self.oversampling + self._center
         phase = np.empty((n, 18))
@@ -191,7 +191,7 @@ class Models:
     Parameters
     ----------
     grids, oversampling, phase, shares, half, center, flux
-        As `wpdc_gwcs.kernels.paint_stars` takes them.
+        Arguments of `wpdc_gwcs.kernels.paint_stars`.
     """
 
     grids: np.ndarray
@@ -218,16 +218,16 @@ class Models:
             kernels.paint_stars(*numbers, center, self.flux[k], image)
 
     def take(self, light, image, rows, *, first_row=0):
-        """Take light off some rows of an image where these models were painted.
+        """Subtract light from some rows of an image in the pixels of these models.
 
         Parameters
         ----------
         light : (n, nx) float32 ndarray
-            The light of all models; on return without that in the pixels of these.
+            The light of all models; on return, it is zero in the pixels of these models.
         image : (n, nx) float32 ndarray
             Rows of the image.
         rows : (int, int)
-            The first of these rows that changes, and the one behind the last.
+            The first row that changes, and the row after the last one.
         first_row : int, optional
             Number of the first row.
         """

@@ -13,10 +13,10 @@ from wpdc_gwcs.threads import count_threads, map_threads
 
 __all__ = ["Painter", "Residual", "Scene"]
 
-# Pixels worked on at a time where stars are drawn, and where all pixels are touched: these fit into
-# the cache of a processor.
+# Number of pixels processed at a time, if stars are drawn, and if all pixels are used, which fit
+# into the cache of a processor.
 _STRIP, _CACHED = 3_000_000, 500_000
-# Stars looked at at a time.
+# Number of stars processed at a time.
 _MANY = 10_000
 
 # Half widths in px with which stars are drawn, up to that of the profile; faint stars are smaller.

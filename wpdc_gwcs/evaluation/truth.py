@@ -18,7 +18,7 @@ __all__ = ["TruthScore", "pool_scores", "score_frame", "tabulate_scores"]
 
 _ALL = "all"
 # For a source list, a pair is wrong if its star is not the star of the source.  For an image, it is
-# wrong if the source is further from its star than these limits, in errors and in px.
+# wrong if the source is farther from its star than these limits, in errors and in px.
 _FAR_SIGMA, _FAR_PX = 5.0, 1.0
 
 

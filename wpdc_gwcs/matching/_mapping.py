@@ -262,7 +262,7 @@ def fit_smooth_map(
     max_order : int
         Highest order to try.
     clip : float
-        Pairs further off than this many robust standard deviations are not used.
+        Pairs with residuals of more than this many robust standard deviations are not used.
     narrow : int, optional
         Axis along which the frame is narrow, see `find_narrow_axis`.
 

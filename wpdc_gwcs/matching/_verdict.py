@@ -229,7 +229,7 @@ def without_rival(problem, match, clock):
 
 
 def header_error(problem, match):
-    """Build the error that names what is further from the header than allowed, or None.
+    """Build the error for a match that is farther from the header than allowed, or None.
 
     Rotation and scale are those at the center of the frame, or those of the pairs as a whole
     where these are closer to the header: with few pairs in a part of the frame only, the
