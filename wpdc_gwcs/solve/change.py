@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 
 from wpdc_gwcs.solve.basis import Basis, patch
 from wpdc_gwcs.solve.model import focal_variance, residuals
+from wpdc_gwcs.solve.normal import posterior_factor
 from wpdc_gwcs.solve.spectrum import Spectrum
 from wpdc_gwcs.solve.strength import FieldPrior, log_strength
 
@@ -270,9 +271,7 @@ def _spectra(products, basis, prior, errors, scales, stale):
 def _marginal(normal, right, power):
     """Marginalize a field from normal equations; return these and its log evidence."""
     root = np.sqrt(power)
-    inner = normal * root[:, None] * root
-    inner[np.diag_indices_from(inner)] += 1.0
-    factor, info = lapack.dpotrf(inner, lower=1, overwrite_a=1)
+    factor, info = posterior_factor(normal, root)
     if info != 0:
         return normal, right, -np.inf
     half, _ = lapack.dtrtrs(factor, root[:, None] * np.column_stack([normal, right]), lower=1)
@@ -299,9 +298,8 @@ def _posterior(products, basis, field, change):
     for a in range(2):
         left = [_marginal(*axes[a], power) for axes in products]
         normal, right = (sum(part[i] for part in left) for i in range(2))
-        inner = normal * root[:, None] * root + np.eye(len(root))
-        factor = np.linalg.cholesky(inner)
-        half = np.linalg.solve(factor, np.diag(root))
+        factor, _ = posterior_factor(normal, root)
+        half, _ = lapack.dtrtrs(factor, np.diag(root), lower=1)
         halves.append(half)
         means.append(half.T @ (half @ right))
     return np.array(means), np.array(halves)

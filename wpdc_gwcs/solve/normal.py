@@ -25,6 +25,7 @@ __all__ = [
     "frame_equations",
     "invert",
     "posterior",
+    "posterior_factor",
 ]
 
 
@@ -93,6 +94,30 @@ def frame_equations(design, residual, weight, *, field=None):
         half, _ = lapack.dtrtrs(factor, cross, lower=1)
         products = products - half.T @ half
     return products[:n, :n], products[:n, n]
+
+
+def posterior_factor(normal, root):
+    """Factor the posterior precision of coefficients in units of their prior.
+
+    Parameters
+    ----------
+    normal : (K, K) ndarray
+        Normal matrix, symmetric.
+    root : (K,) ndarray
+        Prior standard deviations.
+
+    Returns
+    -------
+    factor : (K, K) ndarray
+        Lower Cholesky factor of ``1 + root normal root``.
+    info : int
+        0, unless the matrix is not positive definite.
+    """
+    inner = np.multiply(normal, root, order="C")
+    inner *= root[:, None]
+    inner.flat[:: len(root) + 1] += 1.0
+    # The transpose of a symmetric matrix is the same in the order of LAPACK, without a copy.
+    return lapack.dpotrf(inner.T, lower=1, overwrite_a=1)
 
 
 def invert(matrix):

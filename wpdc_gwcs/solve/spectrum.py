@@ -13,6 +13,7 @@ from scipy.linalg import lapack
 from scipy.optimize import minimize
 
 from wpdc_gwcs.solve.basis import BEND_DEGREES, Basis, inner_products
+from wpdc_gwcs.solve.normal import posterior_factor
 
 __all__ = ["Products", "Spectrum", "learn_spectra", "pooled_spectrum", "products"]
 
@@ -154,9 +155,7 @@ class Products:
         scale, total = np.sqrt(spectrum.prior(self.basis)), 0.0
         for mine, matrix, right in self.blocks[spectrum.kind]:
             root = scale[mine]
-            inner = matrix * root[:, None] * root
-            inner[np.diag_indices_from(inner)] += 1.0
-            factor, info = lapack.dpotrf(inner, lower=1, overwrite_a=1)
+            factor, info = posterior_factor(matrix, root)
             if info != 0:
                 return -np.inf
             half, _ = lapack.dtrtrs(factor, right * root, lower=1)

@@ -17,6 +17,8 @@ from numpy.polynomial.legendre import legvander
 from scipy.interpolate import CubicSpline
 from scipy.linalg import lapack
 
+from wpdc_gwcs.solve.normal import posterior_factor
+
 __all__ = ["Waves", "candidates", "count_places", "fit_waves"]
 
 # Size of the patch of the waves, in units of the detector.  It makes the steps of the wave number
@@ -280,7 +282,7 @@ def fit_waves(low, high, focal, residual, variance):
             break
         strong = seen[np.argsort(-root[seen], kind="stable")[:_MOST_ZOOMED]]
         orders, step = _finer(orders[:, seen], orders[:, strong]), 0.5 * step
-    half = lapack.dtrtrs(_factor(normal, root), np.diag(root), lower=1)[0]
+    half = lapack.dtrtrs(posterior_factor(normal, root)[0], np.diag(root), lower=1)[0]
     coefficients = (half.T @ (half @ right)).T
     # Mean square of both axes over that of the errors at each place.
     power = np.sum(coefficients * (coefficients @ normal)) / (2 * n_places)
@@ -300,20 +302,13 @@ def _learned(normal, right, told, n):
     power = 10.0 * least
     for _ in range(_STEPS):
         root = np.sqrt(power)[group]
-        factor = _factor(normal, root)
-        inverse = lapack.dpotri(factor, lower=1)[0]
-        scaled = lapack.dpotrs(factor, root[:, None] * right, lower=1)[0]
+        factor, _ = posterior_factor(normal, root)
+        half, _ = lapack.dtrtri(factor, lower=1, overwrite_c=1)
+        scaled = half.T @ (half @ (root[:, None] * right))
         square = np.bincount(group, np.sum((root[:, None] * scaled) ** 2, axis=1))
-        known = np.bincount(group, 2 * (1.0 - np.diagonal(inverse)))
+        known = np.bincount(group, 2 * (1.0 - np.einsum("ij,ij->j", half, half)))
         power = (_GUESS_WEIGHT * least + square) / (_GUESS_WEIGHT + known)
     return np.sqrt(power)[group], known
-
-
-def _factor(normal, root):
-    """Lower Cholesky factor of the posterior precision in units of the prior."""
-    inner = normal * root[:, None] * root
-    inner[np.diag_indices_from(inner)] += 1.0
-    return lapack.dpotrf(inner, lower=1, clean=1)[0]
 
 
 def _normal_equations(shape, focal, residual, weight):
