@@ -3,6 +3,7 @@
 import gc
 import json
 import os
+import pickle
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -241,8 +242,10 @@ class Pool(ThreadPoolExecutor):
     def __init__(self):
         super().__init__(2)
         self.n_solved = 0
+        self.largest = 0
 
     def submit(self, function, item):
+        self.largest = max(self.largest, len(pickle.dumps(item)))
         if function is not solving_module.solve_or_fail:
             return super().submit(function, item)
         self.n_solved += 1
@@ -273,6 +276,11 @@ def the_same(run, folder, alone):
     for name in ("frame", "status", "n_sources", "n_matched"):
         assert list(run.summary[name]) == list(expected.summary[name])
     np.testing.assert_allclose(run.summary["sigma_dx"], expected.summary["sigma_dx"], rtol=1e-9)
+    # A residual map is most of a stored solution; only its file has it.
+    for name, solution in expected.solutions.items():
+        for there in (run.solutions[name], read(folder / f"{name}.solution.asdf")):
+            np.testing.assert_array_equal(there.residual_map.sums, solution.residual_map.sums)
+            np.testing.assert_array_equal(there.lookup_table.dx, solution.lookup_table.dx)
     states = read_manifest(folder / "manifest.json").frames
     assert all(states[name]["state"] == "solved" for name in expected.summary["frame"])
 
@@ -286,6 +294,8 @@ def test_batches_are_solved_by_workers_or_else_here(inputs, pairs, tmp_path, alo
             frames, reference, solution=stored, output=tmp_path, executor=pool, keep=False
         )
     assert pool.n_solved == 3
+    (solution,) = run.solutions.values()
+    assert pool.largest < len(pickle.dumps(solution.residual_map))
     the_same(run, tmp_path, alone)
     assert not list(tmp_path.glob(".*.part"))
 

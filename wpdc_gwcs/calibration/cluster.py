@@ -119,6 +119,8 @@ class _WatchedExecutor(Executor):
         return max(1, sum(worker.get("nthreads", 1) for worker in workers.values()))
 
     def submit(self, fn, /, *args, **kwargs):
+        from distributed.protocol.pickle import dumps
+
         future = Future()
         with self._lock:
             if self._error is not None:
@@ -127,7 +129,8 @@ class _WatchedExecutor(Executor):
         with warnings.catch_warnings():
             # Frames that are solved together have about 10 MB, for which Dask issues a warning.
             warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
-            inner = self._pool.submit(fn, *args, **kwargs)
+            # Bytes: otherwise, the scheduler would make the objects too.
+            inner = self._pool.submit(_call, dumps((fn, args, kwargs)))
         inner.add_done_callback(partial(self._pass_on, future))
         return future
 
@@ -190,3 +193,11 @@ class _WatchedExecutor(Executor):
         for future in left:
             if future.set_running_or_notify_cancel():
                 future.set_exception(error)
+
+
+def _call(message):
+    """Call a function in a worker."""
+    from distributed.protocol.pickle import loads
+
+    function, args, kwargs = loads(message)
+    return function(*args, **kwargs)

@@ -409,7 +409,7 @@ class _Solving:
         outcome, batch = None, self.batch
         if self._future is not None:
             try:
-                outcome = self._future.result()
+                outcome = batch.complete(self._future.result())
             except Exception as problem:  # noqa: BLE001  Such as the death of a worker.
                 log.info(
                     "solution: %s could not be solved by a worker, and are solved here: %s",

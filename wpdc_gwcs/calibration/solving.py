@@ -15,7 +15,7 @@ from wpdc_gwcs.calibration.matched import FailedFrame
 from wpdc_gwcs.calibration.results import Outcome, with_files
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.summary import summary_row
-from wpdc_gwcs.calibration.workers import internal_error
+from wpdc_gwcs.calibration.workers import internal_error, without_maps
 from wpdc_gwcs.camera import build_camera
 from wpdc_gwcs.exceptions import WPDCError, without_frames
 
@@ -56,16 +56,48 @@ class Batch:
     run: str | None
 
     def alone(self):
-        """Return the batch for another process: its frames have been measured and load nothing.
+        """Return the batch for another process, without what its solution does not need.
 
         Returns
         -------
         Batch
-            Batch with the same result.
+            Batch with the result that `complete` makes the same.
         """
+        # The frames have been measured and load nothing more.
         unloaded = {"load_image": None, "load_mask": None, "load_weight": None}
         frames = [replace(f, load_sources=Table, **unloaded) for f in self.frames]
-        return replace(self, frames=frames)
+        solution = self.solution if self.update else without_maps(self.solution)
+        return replace(self, frames=frames, solution=solution)
+
+    def complete(self, outcome):
+        """Put back what `alone` has left out.
+
+        Parameters
+        ----------
+        outcome : Outcome
+            Result of the batch of another process.
+
+        Returns
+        -------
+        Outcome
+            Result of the batch.  Stored solutions share their tables with those of all batches.
+        """
+        if self.update:
+            return outcome
+
+        def completed(solutions):
+            return {name: _with_tables(one, self.solution[name]) for name, one in solutions.items()}
+
+        cameras = [replace(c, solutions=completed(c.solutions)) for c in outcome.cameras]
+        return replace(outcome, solutions=completed(outcome.solutions), cameras=cameras)
+
+
+def _with_tables(solution, stored):
+    """Give a solution the tables of the stored one, if there is one: they have not changed."""
+    if stored is None:
+        return solution
+    names = ("lookup_table", "table_sigma", "residual_map")
+    return replace(solution, **{name: getattr(stored, name) for name in names})
 
 
 def solve_or_fail(batch):

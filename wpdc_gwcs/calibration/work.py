@@ -17,7 +17,7 @@ from wpdc_gwcs.calibration.matched import FailedFrame, sky_of_frame
 from wpdc_gwcs.calibration.mosaic import start_from_neighbors
 from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.story import say, tell_catalog
-from wpdc_gwcs.calibration.workers import Task, stored_of
+from wpdc_gwcs.calibration.workers import Task, stored_of, without_maps
 from wpdc_gwcs.catalogs import Region, fill_motions, read_catalog
 from wpdc_gwcs.exceptions import MatchError
 
@@ -159,13 +159,14 @@ def _submit(group, catalog, run, workers, *, narrow, sources=None):
     """
     settings = replace(run.settings, blind=False) if narrow else run.settings
     tied = _tied(group) if narrow else ()
+    solution = without_maps(run.solution)
     return {
         frame.name: workers.submit(
             Task(
                 frame,
                 settings if not narrow or frame.name in tied else run.settings,
                 catalog,
-                run.solution,
+                solution,
                 None if sources is None else sources[frame.name],
             )
         )

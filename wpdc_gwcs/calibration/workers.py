@@ -45,7 +45,7 @@ from wpdc_gwcs.exceptions import (
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.threads import one_blas_thread, share_processors
 
-__all__ = ["Task", "Workers", "internal_error", "stored_of"]
+__all__ = ["Task", "Workers", "internal_error", "stored_of", "without_maps"]
 
 # A process may die for a temporary reason, for example memory used by others.
 _TRIES = 2
@@ -96,6 +96,24 @@ def stored_of(solution, detector):
         None if there is none.
     """
     return solution.get(detector) if isinstance(solution, Mapping) else solution
+
+
+def without_maps(solution):
+    """Return stored solutions without their residual maps, which are most of their size.
+
+    Parameters
+    ----------
+    solution : DistortionSolution, mapping or None
+        One solution, or solutions by detector.
+
+    Returns
+    -------
+    DistortionSolution, dict or None
+        The same, for all that does not update them.
+    """
+    if isinstance(solution, Mapping):
+        return {name: without_maps(one) for name, one in solution.items()}
+    return None if solution is None else replace(solution, residual_map=None)
 
 
 def internal_error(problem):
