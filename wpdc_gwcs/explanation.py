@@ -1,4 +1,4 @@
-"""Explanation why a frame is solved, degraded or refused, stage by stage.
+"""Explanation of why a frame is solved, degraded or refused, stage by stage.
 
 ::
 
