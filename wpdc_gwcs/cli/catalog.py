@@ -54,13 +54,13 @@ Around = Annotated[
 _PURPOSES = {
     "pmra": "stars stay where they were at the epoch of the catalog",
     "ref_epoch": "2016.0 is assumed",
-    "phot_g_mean_mag": "bright stars cannot be matched first, --max-mag has no effect",
-    "ra_error": "all stars count alike",
-    "pmra_error": "old positions count like new ones",
+    "phot_g_mean_mag": "bright stars cannot be matched first, and --max-mag has no effect",
+    "ra_error": "all stars have the same weight",
+    "pmra_error": "errors of positions do not grow with time",
     "parallax": "no annual parallax",
-    "ra_pmra_corr": "errors at epoch without correlations",
-    "radial_velocity": "no motion in perspective",
-    "ruwe": "binaries count like single stars",
+    "ra_pmra_corr": "errors at the epoch of a frame ignore correlations",
+    "radial_velocity": "no perspective motion",
+    "ruwe": "binaries have the same weight as single stars",
     "bp_rp": "no refraction or lateral color",
 }
 
