@@ -352,8 +352,8 @@ def calibrate_command(
     if not quiet:
         if resume:
             typer.echo(
-                f"{len(run.resumed)} of {counted(len(run.summary), 'frame')} skipped: run "
-                f"{run.run_id} has done them already"
+                f"{len(run.resumed)} of {counted(len(run.summary), 'frame')} skipped: already "
+                f"done by run {run.run_id}"
             )
         print_summary(run, output)
         if update:
