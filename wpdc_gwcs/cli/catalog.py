@@ -47,7 +47,7 @@ Box = Annotated[
 ]
 Around = Annotated[
     list[str] | None,
-    typer.Option(metavar="FRAME", help="Part of the sky: around this frame (once for each)."),
+    typer.Option(metavar="FRAME", help="Part of the sky: around this frame; can be repeated."),
 ]
 
 # Purpose of columns, reported if they are missing.
@@ -96,7 +96,7 @@ def prepare_command(
     ] = None,
     max_error: Annotated[
         float | None,
-        typer.Option(metavar="MAS", help="Largest error of the position along an axis."),
+        typer.Option(metavar="MAS", help="Largest error of the position along either axis."),
     ] = None,
     tap_url: TapUrl = None,
     cache: Cache = None,
