@@ -72,7 +72,7 @@ def folder(tmp_path):
         ("plain.fits", "gaia.fits", "; try: --wcs HEADER, with the header of another exposure"),
         ("list.ecsv", "gaia.fits", "; try: --wcs HEADER, with the header of another exposure"),
         ("cut.fits", "gaia.fits", "; try: get the file again, or leave it out"),
-        ("gaia.fits", "gaia.fits", "; try: wpdc show {folder}/gaia.fits, which tells what it is"),
+        ("gaia.fits", "gaia.fits", "; try: wpdc show {folder}/gaia.fits, which says what it is"),
     ],
 )
 def test_of_real_errors(folder, capsys, frame, catalog, hint):

@@ -593,7 +593,8 @@ def test_signals_end_all_processes_quietly(inputs, tmp_path, number, to_all):
     expected = (
         ""
         if number == signal.SIGKILL
-        else "wpdc: error: interrupted; files already written are complete; go on with --resume\n"
+        else "wpdc: error: interrupted; files already written are complete; "
+        "continue with --resume\n"
     )
     assert errors == expected
     assert output == ""

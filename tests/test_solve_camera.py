@@ -256,7 +256,7 @@ class TestRich:
         changed = stored | {"b": replace(stored["b"], pv=curved)}
         result = solve(camera.frames, image_shape=SHAPE, solution=changed)
         assert set(result.rejected) == {"b0", "b1", "b2"}
-        assert all("a stored solution that does not hold" in r for r in result.rejected.values())
+        assert all("a stored solution that is not valid" in r for r in result.rejected.values())
 
     def test_wrong_pairs_of_one_frame(self, camera, rng):
         """It is left out, and the eight others are as good as ever."""

@@ -1,4 +1,4 @@
-"""Explanation why a frame is solved, degraded or refused, stage by stage.
+"""Explanation of why a frame is solved, degraded or refused, stage by stage.
 
 ::
 
@@ -157,7 +157,9 @@ def explain_frame(frame, catalog, settings=None):
     sky = sky_of_frame(frame, settings)
     if sky is None:
         story.advice.append("give a header with a celestial WCS (--wcs HEADER)")
-        return story.fail("frame", MatchError(f"{frame.source}: its WCS tells no place on the sky"))
+        return story.fail(
+            "frame", MatchError(f"{frame.source}: its WCS gives no position on the sky")
+        )
     _tell_frame(story)
     try:
         sources = with_errors(measure_sources(frame, settings))
@@ -381,5 +383,5 @@ def _try_otherwise(story, stars, sources, *, last=True):
         story.advice.append(
             "neither a blind search nor fainter stars match: check whether frame and catalog show "
             "the same sky, whether the scale is right (--pixel-scale), and the position angle: "
-            "other angles than multiples of 90 deg are not searched (--wcs HEADER)"
+            "angles other than multiples of 90 deg are not searched (--wcs HEADER)"
         )

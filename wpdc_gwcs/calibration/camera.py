@@ -286,8 +286,8 @@ def _dated(solution, frames, stored):
     earlier = stored.provenance.get("epochs") or []
     if first is None or (earlier and first <= earlier[1]):
         log.warning(
-            "detector %s: no epoch tells the stored solution from the changed one: neither gets "
-            "a validity", solution.detector,
+            "detector %s: no epoch separates the stored solution from the changed one: neither "
+            "gets a period of validity", solution.detector,
         )  # fmt: skip
         return solution
     return replace(solution, valid_from=first)

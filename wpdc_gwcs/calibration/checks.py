@@ -98,7 +98,7 @@ def check_solution(frame, calibration, *, stored=None, known=False):
     if expected is not None and sigma > max(_STORED_RATIO * expected, _MAX_OFFSET):
         raise FitError(
             f"{frame.source}: the residuals scatter by {sigma:.2f} px, those of the stored "
-            f"solution by {expected:.2f} px: it is not for this detector, or no longer holds"
+            f"solution by {expected:.2f} px: it is not for this detector, or no longer valid"
         )
 
 

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 _PERIOD = 0.5
 # A client may have no answer for this long, s, just because its machine is busy.
 _BUSY = 10.0
-_GO_ON = "what is done is kept: go on with --resume (resume=True)"
+_GO_ON = "results so far are kept: continue with --resume (resume=True)"
 
 
 @contextlib.contextmanager

@@ -204,7 +204,7 @@ def tell_solution(solution):
     else:
         text += f" and table of {len(lookup.x_grid)} x {len(lookup.y_grid)} nodes"
     if table.get("kernel") == "none":
-        text += " (residuals speak for no more than the terms of the camera)"
+        text += " (the residuals show nothing beyond the terms of the camera)"
     elif table.get("kernel"):
         text += f" ({table['kernel']} of {table['freedom']:.0f} degrees of freedom)"
     if "n_used" in statistics:

@@ -374,7 +374,7 @@ class Workers:
                     raise CancelledError from None
         raise InternalError(
             f"internal error: its process died {_TRIES} times, exit status {status} "
-            "(-9: killed, mostly for want of memory)"
+            "(-9: killed, usually because memory ran out)"
         )
 
 

@@ -197,7 +197,7 @@ def _run(args, received):
         return _fail(err, 1, args)
     except (KeyboardInterrupt, typer.Abort):
         status = 128 + received[0] if received else _INTERRUPTED
-        more = "; go on with --resume" if "--resume" in _options_of(args) else ""
+        more = "; continue with --resume" if "--resume" in _options_of(args) else ""
         return _fail(f"interrupted; files already written are complete{more}", status)
     except BrokenPipeError:
         # The reader of our output is gone, which is not an error; the exit must not flush again.

@@ -87,7 +87,7 @@ def calibrate_command(
     catalog: Catalog,
     output: Annotated[
         Path,
-        typer.Option("--output", metavar="DIR", help="Folder for the results; made if needed."),
+        typer.Option("--output", metavar="DIR", help="Folder for the results; created if needed."),
     ],
     wcs: WcsFile = None,
     detector: Annotated[
@@ -284,8 +284,8 @@ def calibrate_command(
         raise InputError("--update needs --method wpdc: the paper's table is always made anew")
     if no_camera and exposure_key is not None:
         raise InputError(
-            "--exposure-key and --no-camera exclude each other: one ties detectors, the other "
-            "does not"
+            "--exposure-key and --no-camera cannot be used together: one ties detectors to each "
+            "other, the other separates them"
         )
     if detector is not None and not (detector.strip() and detector.isprintable()):
         raise InputError(f"--detector must be a printable name, got {detector!r}")
@@ -352,8 +352,8 @@ def calibrate_command(
     if not quiet:
         if resume:
             typer.echo(
-                f"{len(run.resumed)} of {counted(len(run.summary), 'frame')} skipped: run "
-                f"{run.run_id} has done them already"
+                f"{len(run.resumed)} of {counted(len(run.summary), 'frame')} skipped: already "
+                f"done by run {run.run_id}"
             )
         print_summary(run, output)
         if update:

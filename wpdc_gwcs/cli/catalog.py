@@ -47,20 +47,20 @@ Box = Annotated[
 ]
 Around = Annotated[
     list[str] | None,
-    typer.Option(metavar="FRAME", help="Part of the sky: around this frame (once for each)."),
+    typer.Option(metavar="FRAME", help="Part of the sky: around this frame; can be repeated."),
 ]
 
 # Purpose of columns, reported if they are missing.
 _PURPOSES = {
     "pmra": "stars stay where they were at the epoch of the catalog",
     "ref_epoch": "2016.0 is assumed",
-    "phot_g_mean_mag": "bright stars cannot be matched first, --max-mag has no effect",
-    "ra_error": "all stars count alike",
-    "pmra_error": "old positions count like new ones",
+    "phot_g_mean_mag": "bright stars cannot be matched first, and --max-mag has no effect",
+    "ra_error": "all stars have the same weight",
+    "pmra_error": "errors of positions do not grow with time",
     "parallax": "no annual parallax",
-    "ra_pmra_corr": "errors at epoch without correlations",
-    "radial_velocity": "no motion in perspective",
-    "ruwe": "binaries count like single stars",
+    "ra_pmra_corr": "errors at the epoch of a frame ignore correlations",
+    "radial_velocity": "no perspective motion",
+    "ruwe": "binaries have the same weight as single stars",
     "bp_rp": "no refraction or lateral color",
 }
 
@@ -96,7 +96,7 @@ def prepare_command(
     ] = None,
     max_error: Annotated[
         float | None,
-        typer.Option(metavar="MAS", help="Largest error of the position along an axis."),
+        typer.Option(metavar="MAS", help="Largest error of the position along either axis."),
     ] = None,
     tap_url: TapUrl = None,
     cache: Cache = None,

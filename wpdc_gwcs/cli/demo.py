@@ -20,9 +20,9 @@ DEMO_LIMIT = 0.02
 @app.command("demo", epilog="Example: wpdc demo --output demo")
 def demo_command(
     output: Annotated[
-        Path, typer.Option("--output", metavar="DIR", help="Folder to write to; made if needed.")
+        Path, typer.Option("--output", metavar="DIR", help="Folder to write to; created if needed.")
     ] = Path("wpdc-demo"),
-    seed: Annotated[int, typer.Option(metavar="N", help="Another seed, another camera.")] = 1,
+    seed: Annotated[int, typer.Option(metavar="N", help="Another seed gives another camera.")] = 1,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,

@@ -64,7 +64,7 @@ def export_command(
         typer.Option(
             "--output",
             metavar="OUT",
-            help="File to write, or a folder for STEM.head, STEM.sip.fits and so on (made if "
+            help="File to write, or a folder for STEM.head, STEM.sip.fits and so on (created if "
             "needed for several FILEs); with --into, a copy.",
         ),
     ] = None,

@@ -79,11 +79,11 @@ _OF_COMMANDS = (
     ),
     (
         r"(?P<path>.+?): must have an image, FITS_LDAC sources or a table",
-        "wpdc show {path}, which tells what it is",
+        "wpdc show {path}, which says what it is",
     ),
     (
         r"(?P<path>.+?): must have a 'wpdc' tree|(?P<other>.+?): --solution needs",
-        "wpdc show {path}, which tells what it is",
+        "wpdc show {path}, which says what it is",
     ),
     (
         r".*not a manifest of a run|.*must be of the run .* with its tables",
@@ -114,8 +114,8 @@ _OF_FRAMES = (
     (r".*the frame is from detector", "--detector NAME if the header is wrong, or another "
      "--solution"),
     (r".*it cannot be updated", "a run of these frames without --update"),
-    (r".*those of the stored solution by", "a run without --solution; wpdc monitor tells whether "
-     "the solution still holds"),
+    (r".*those of the stored solution by", "a run without --solution; wpdc monitor tests whether "
+     "the solution is still valid"),
     (r".*contradicts those of the other detectors", "--no-camera if this header is right"),
     (r".*could be fitted; at least", "more exposures of this detector in one run, or its stored "
      "--solution"),

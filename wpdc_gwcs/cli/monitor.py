@@ -130,7 +130,7 @@ def monitor_command(
         write_table(_stacked(cells), cells_file, overwrite=overwrite)
     if drifted:
         typer.echo(
-            "make a new solution from frames of now (wpdc calibrate), or let this one follow "
+            "make a new solution from recent frames (wpdc calibrate), or update this one "
             "(wpdc calibrate --solution ... --update)",
             err=True,
         )

@@ -226,7 +226,7 @@ Cache = Annotated[
     typer.Option(
         metavar="DIR",
         envvar="WPDC_GWCS_CACHE",
-        help="Folder for downloaded stars; default: in the cache of astropy.",
+        help="Folder for downloaded stars; default: in the user's cache folder.",
     ),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")]

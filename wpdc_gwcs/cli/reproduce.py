@@ -20,17 +20,19 @@ def reproduce_command(
         str,
         typer.Argument(
             metavar="PART",
-            help="detectors, cluster, bass, weights, centroids, or all of them: all.",
+            help="detectors, cluster, bass, weights or centroids; all for all of them.",
         ),
     ],
     output: Annotated[
-        Path, typer.Option("--output", metavar="DIR", help="Folder to write to; made if needed.")
+        Path, typer.Option("--output", metavar="DIR", help="Folder to write to; created if needed.")
     ],
     quick: Annotated[
         bool,
-        typer.Option("--quick", help="Small detectors and few fields: minutes instead of hours."),
+        typer.Option(
+            "--quick", help="Small detectors and few fields: minutes instead of about an hour."
+        ),
     ] = False,
-    jobs: Annotated[int, typer.Option(metavar="N", help="Processes that work at a time.")] = 1,
+    jobs: Annotated[int, typer.Option(metavar="N", help="Number of processes.")] = 1,
     # SEED of the reproduction, which is imported only when needed.
     seed: Annotated[
         int, typer.Option(metavar="N", help="Another seed gives another camera.")

@@ -24,7 +24,7 @@ _MOST_NAMED = 8
 )
 def simulate_command(
     output: Annotated[
-        Path, typer.Option("--output", metavar="DIR", help="Folder to write to; made if needed.")
+        Path, typer.Option("--output", metavar="DIR", help="Folder to write to; created if needed.")
     ],
     preset: Annotated[
         str,
@@ -54,7 +54,7 @@ def simulate_command(
         list[str] | None,
         typer.Option(
             metavar="RA,DEC",
-            help="Center of a field, ICRS in deg, or as 6:48:59,-36:00:18; one for each field.",
+            help="Center of a field: ICRS in deg, or as 6:48:59,-36:00:18; one for each field.",
         ),
     ] = None,
     images: Annotated[
@@ -66,7 +66,7 @@ def simulate_command(
         ),
     ] = None,
     sources: Annotated[
-        str, typer.Option(**one_of("ldac", "ecsv"), help="Form of the lists.")
+        str, typer.Option(**one_of("ldac", "ecsv"), help="Format of the lists.")
     ] = "ldac",
     size: Annotated[
         str | None,
@@ -108,17 +108,21 @@ def simulate_command(
     ] = 0.0,
     lateral_color: Annotated[
         float,
-        typer.Option(metavar="MAS", help="Shift outwards at the rim per magnitude of color."),
+        typer.Option(
+            metavar="MAS", help="Outward shift at the farthest corner per magnitude of color."
+        ),
     ] = 0.0,
     reference_limit: Annotated[
         float | None,
-        typer.Option(metavar="MAG", help="Faintest star of the catalog; default all."),
+        typer.Option(
+            metavar="MAG", help="Magnitude of the faintest star in the catalog; default all."
+        ),
     ] = None,
     catalog_errors: Annotated[
         bool | None,
         typer.Option(
             "--catalog-errors/--no-catalog-errors",
-            help="Give the catalog Gaia's errors; default all but csst-msc.",
+            help="Give the catalog errors like Gaia's; default for all but csst-msc.",
         ),
     ] = None,
     cluster: Annotated[
@@ -128,13 +132,13 @@ def simulate_command(
         ),
     ] = 0.0,
     core_radius: Annotated[
-        float, typer.Option(metavar="ARCSEC", help="Core radius of the cluster (King's).")
+        float, typer.Option(metavar="ARCSEC", help="Core radius of the cluster (King profile).")
     ] = 20.0,
     tidal_radius: Annotated[
         float, typer.Option(metavar="ARCSEC", help="Radius at which the cluster ends.")
     ] = 400.0,
     galaxies: Annotated[
-        float, typer.Option(metavar="N", help="Galaxies per square arcmin, in no catalog.")
+        float, typer.Option(metavar="N", help="Galaxies per square arcmin, not in the catalog.")
     ] = 0.0,
     cosmic_rays: Annotated[int, typer.Option(metavar="N", help="Cosmic rays in each image.")] = 0,
     epoch: Annotated[
@@ -154,10 +158,13 @@ def simulate_command(
     ] = None,
     fwhm: Annotated[float | None, typer.Option(metavar="PX", help="Width of the PSF.")] = None,
     spurious: Annotated[
-        float | None, typer.Option(metavar="SHARE", help="Spurious sources in the lists.")
+        float | None,
+        typer.Option(
+            metavar="SHARE", help="Spurious sources in the lists, as a share of the stars."
+        ),
     ] = None,
     lost: Annotated[
-        float, typer.Option(metavar="SHARE", help="Stars missing in the lists.")
+        float, typer.Option(metavar="SHARE", help="Share of stars missing from the lists.")
     ] = 0.05,
     seed: Annotated[int, typer.Option(metavar="N", help="Another seed gives another camera.")] = 1,
     overwrite: Overwrite = False,

@@ -117,7 +117,7 @@ def without_wrong(o, state):
 def _causes(o, state, f):
     """Name what may make the residuals of a frame large."""
     if isinstance(state.model.tables[o.detector_of[f]], StoredMap):
-        return "wrong pairs, bad positions, or a stored solution that does not hold"
+        return "wrong pairs, bad positions, or a stored solution that is not valid"
     return "wrong pairs or bad positions"
 
 
