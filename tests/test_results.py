@@ -121,7 +121,7 @@ def test_tables_of_another_run_are_not_evaluated(frames, inputs, tmp_path, capsy
     path = tmp_path / f"{frames[0].name}.matches.ecsv"
     path.write_text(re.sub(r"run: \w+", "run: another", path.read_text()))
     assert command(["evaluate", str(tmp_path)]) == 2
-    assert "must be of the same run as" in capsys.readouterr().err
+    assert "must come from the same run as" in capsys.readouterr().err
 
 
 def test_one_frame_takes_any_catalog(frames, inputs):
@@ -182,7 +182,7 @@ def test_resume_says_what_differs(frames, inputs, tmp_path, simulation):
     calibrate(frames, inputs[1], output=tmp_path)
     other = Table.read(inputs[1])[:-1]
     for options, message in (
-        ({"settings": Settings(n_grid=20)}, "n_grid 50, now 20; to begin anew: --overwrite"),
+        ({"settings": Settings(n_grid=20)}, "n_grid 50, now 20; to start over: --overwrite"),
         ({"catalog": other}, "another catalog"),
     ):
         options = {"catalog": inputs[1], **options}

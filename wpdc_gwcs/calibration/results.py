@@ -245,7 +245,7 @@ class ResultFolder:
         if found:
             raise InputError(
                 f"{self.folder}: a run must be resumed with the same choices: {'; '.join(found)}; "
-                "to begin anew: --overwrite"
+                "to start over: --overwrite"
             )
         rows = _read_rows(self.folder / SUMMARY, earlier.run)
         states = {}
@@ -348,7 +348,9 @@ class ResultFolder:
                 }
                 runs = [found.provenance.get("run"), *(t.meta.get("run") for t in tables.values())]
                 if any(one != run for one in runs):
-                    raise InputError(f"{path}: must be of the run {run} with its tables, is not")
+                    raise InputError(
+                        f"{path}: must come from the same run as its tables ({run}), does not"
+                    )
                 if keep:
                     outcome.calibrations.append(replace(found, **tables))
             elif name.endswith(".solution.asdf"):

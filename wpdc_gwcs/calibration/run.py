@@ -228,7 +228,9 @@ def calibrate(
     if not keep and output is None:
         raise ValueError("keep=False needs output, a folder for the calibrations")
     if update and settings.method == "paper":
-        raise ValueError("update needs method='wpdc': the paper's table is always made anew")
+        raise ValueError(
+            "update needs method='wpdc': the paper's table is always made from scratch"
+        )
     progress = progress or (lambda stage, done, total: None)
     solution = getattr(solution, "solutions", solution)
     frames = _named_apart(tie_exposures(frames)) if solution is None else tie_exposures(frames)

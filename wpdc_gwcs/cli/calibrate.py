@@ -281,7 +281,9 @@ def calibrate_command(
     if update and not solution:
         raise InputError("--update needs the stored solution: --solution FILE")
     if update and method == "paper":
-        raise InputError("--update needs --method wpdc: the paper's table is always made anew")
+        raise InputError(
+            "--update needs --method wpdc: the paper's table is always made from scratch"
+        )
     if no_camera and exposure_key is not None:
         raise InputError(
             "--exposure-key and --no-camera cannot be used together: one ties detectors to each "

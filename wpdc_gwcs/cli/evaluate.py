@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
-from wpdc_gwcs.cli.files import match_files
+from wpdc_gwcs.cli.files import match_files, read_with_wcs, wcs_beside
 from wpdc_gwcs.cli.options import (
     Overwrite,
     Quiet,
@@ -287,20 +287,10 @@ class _EvaluatedFrame:
     """Matches of a frame within the limits, and its calibration if the file is there."""
 
     def __init__(self, path, cuts):
-        from wpdc_gwcs.io import read, read_matches
-
         self.name = path.name.removesuffix(".matches.ecsv")
-        matches = read_matches(path)
-        beside = path.with_name(f"{self.name}.wcs.asdf")
-        self.calibration = None
-        crpix = None
-        if beside.exists():
-            calibration = read(beside)
-            runs = calibration.provenance.get("run"), matches.meta.get("run")
-            if runs[0] != runs[1]:
-                raise InputError(
-                    f"{path}: must be of the same run as {beside.name}, {runs[0]}, is of {runs[1]}"
-                )
+        matches, calibration = read_with_wcs(path)
+        self.calibration = crpix = None
+        if calibration is not None:
             self.calibration = replace(calibration, matches=matches)
             crpix = calibration.solution.crpix
         self.matches = matches
@@ -308,7 +298,9 @@ class _EvaluatedFrame:
             return
         by_radius = not (cuts.min_radius is None and cuts.max_radius is None)
         if crpix is None and cuts.about is None and by_radius:
-            raise InputError(f"{path}: radii need --about X,Y, or {beside.name} beside it")
+            raise InputError(
+                f"{path}: radii need --about X,Y, or {wcs_beside(path).name} beside it"
+            )
         try:
             self.matches = matches[cuts.select(matches, (0.0, 0.0) if crpix is None else crpix)]
         except ValueError as err:

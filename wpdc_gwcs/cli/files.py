@@ -241,6 +241,57 @@ def match_files(paths):
     return found
 
 
+def wcs_beside(path):
+    """Return the path of the WCS file that belongs to a match table.
+
+    Parameters
+    ----------
+    path : Path
+        Match table.
+
+    Returns
+    -------
+    Path
+        The file may be absent.
+    """
+    return path.with_name(path.name.removesuffix(".matches.ecsv") + ".wcs.asdf")
+
+
+def read_with_wcs(path):
+    """Read a match table and the WCS file next to it.
+
+    Parameters
+    ----------
+    path : Path
+        Match table.
+
+    Returns
+    -------
+    table : Table
+        The matches.
+    calibration : Calibration or None
+        None if there is no WCS file.
+
+    Raises
+    ------
+    InputError
+        If the two are from different runs.
+    """
+    from wpdc_gwcs.io import read, read_matches
+
+    table, beside = read_matches(path), wcs_beside(path)
+    if not beside.exists():
+        return table, None
+    calibration = read(beside)
+    runs = calibration.provenance.get("run"), table.meta.get("run")
+    if runs[0] != runs[1]:
+        raise InputError(
+            f"{path}: must come from the same run as {beside.name} ({runs[0]}), "
+            f"comes from {runs[1]}"
+        )
+    return table, calibration
+
+
 def wcs_files(paths):
     """List the WCS files of files and folders, in order.
 

@@ -86,8 +86,8 @@ _OF_COMMANDS = (
         "wpdc show {path}, which says what it is",
     ),
     (
-        r".*not a manifest of a run|.*must be of the run .* with its tables",
-        "--overwrite to begin anew, or another --output",
+        r".*not a manifest of a run|.*must come from the same run as its tables",
+        "--overwrite to start over, or another --output",
     ),
     (r".*another solution", "the --solution of that run, or another --output"),
     (

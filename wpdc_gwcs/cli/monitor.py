@@ -8,7 +8,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
-from wpdc_gwcs.cli.files import match_files
+from wpdc_gwcs.cli.files import match_files, read_with_wcs, wcs_beside
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free, require_plotting
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import InputError
@@ -148,23 +148,9 @@ class _MonitoredFrame:
     def matches(self):
         """Read the residuals, with the part that a field has absorbed added back."""
         from wpdc_gwcs.evaluation import residuals_of_attitude
-        from wpdc_gwcs.io import read, read_matches
 
-        table = read_matches(self.path)
-        beside = _wcs_beside(self.path)
-        if not beside.exists():
-            return table
-        calibration = read(beside)
-        runs = calibration.provenance.get("run"), table.meta.get("run")
-        if runs[0] != runs[1]:
-            raise InputError(
-                f"{self.path}: must be of the same run as {beside.name}, {runs[0]}, is of {runs[1]}"
-            )
-        return residuals_of_attitude(calibration, table)
-
-
-def _wcs_beside(path):
-    return path.with_name(path.name.removesuffix(".matches.ecsv") + ".wcs.asdf")
+        table, calibration = read_with_wcs(self.path)
+        return table if calibration is None else residuals_of_attitude(calibration, table)
 
 
 def _solutions(path):
@@ -188,7 +174,7 @@ def _frames(paths, *, need_epochs):
         name = path.name.removesuffix(".matches.ecsv")
         detector, epoch = known[path.parent].get(name, (None, np.nan))
         if detector is None or (need_epochs and not np.isfinite(epoch)):
-            detector, epoch = _told_by_wcs(_wcs_beside(path), detector)
+            detector, epoch = _told_by_wcs(wcs_beside(path), detector)
         if need_epochs and not np.isfinite(epoch):
             raise InputError(
                 f"{path}: --every needs an epoch, which neither summary.ecsv nor the *.wcs.asdf "
