@@ -5,14 +5,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.table import Table
 from astropy.wcs import WCS
 
 from wpdc_gwcs.calibration import Settings, calibrate, match_frame, measure_sources
+from wpdc_gwcs.calibration.matched import catalog_of_frame
 from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs
 from wpdc_gwcs.catalogs import read_catalog
 from wpdc_gwcs.detection import detect_sources
-from wpdc_gwcs.exceptions import DetectionError, MatchError
+from wpdc_gwcs.exceptions import DetectionError, MatchError, WPDCWarning
 from wpdc_gwcs.simulation import simulate
 
 SHAPE = (1024, 1024)
@@ -161,8 +163,39 @@ def test_a_frame_that_fails_leaves_the_others_alone(simulation, catalog):
 def test_catalogue_of_another_part_of_the_sky(simulation, catalog):
     elsewhere = catalog.copy()
     elsewhere["ra"] = np.asarray(elsewhere["ra"]) + 10
-    with pytest.raises(MatchError, match=r"no star within 0\.\d+ deg of the frame's center"):
-        match_frame(simulation.exposures[0].frame(), elsewhere)
+    frame = simulation.exposures[0].frame()
+    with pytest.raises(
+        MatchError, match=r"no star within 0\.\d+ deg of the frame's center"
+    ) as info:
+        match_frame(frame, elsewhere)
+    ra, dec = (float(c) for c in frame.wcs.pixel_to_world_values(511.5, 511.5))
+    stars = SkyCoord(np.asarray(elsewhere["ra"]), np.asarray(elsewhere["dec"]), unit="deg")
+    distance = SkyCoord(ra, dec, unit="deg").separation(stars).deg.min()
+    assert f"its nearest star is {distance:.3g} deg away" in str(info.value)
+    # The same from the part that another process is handed.
+    part = catalog_of_frame(frame, elsewhere, Settings())
+    assert len(part) == 1
+    with pytest.raises(MatchError) as again:
+        match_frame(frame, part)
+    assert str(again.value) == str(info.value)
+
+
+def test_right_ascension_in_hours(simulation, catalog):
+    frame = simulation.exposures[0].frame()
+    header = frame.wcs.to_header()
+    header["CRVAL1"] /= 15
+    frame = replace(frame, wcs=WCS(header))
+    for reference in (catalog, catalog_of_frame(frame, catalog, Settings())):
+        with pytest.raises(MatchError, match="is the right ascension in hours"):
+            match_frame(frame, reference)
+
+
+def test_an_epoch_far_from_that_of_the_catalog_is_doubted(simulation, catalog):
+    frame = replace(simulation.exposures[0].frame(), epoch=1916.0)
+    with pytest.warns(
+        WPDCWarning, match=r"the epoch 1916\.00 is 100 years from that of the catalog"
+    ):
+        calibrate(frame, catalog)
 
 
 def test_stars_without_motion_do_not_spoil_the_solution():

@@ -132,6 +132,12 @@ class TestFewDetections:
 
 
 class TestContradictions:
+    def test_a_map_that_folds(self, case):
+        # As in `test_a_map_that_comes_close_to_folding`, beyond the fold.
+        case.pv = PVPolynomial(pv1_7=-1.2 / (3 * 0.05**2))
+        with pytest.raises(FitError, match=r"a.*: the map folds, .* factors of -0\.\d+ to 1"):
+            case.check()
+
     def test_a_good_solution_passes(self, case):
         case.check()
         assert case.lacks() == []

@@ -67,7 +67,9 @@ def test_a_catalog_of_another_sky(sky):
     assert told.status == "failed"
     assert told.stages[-1].name == "catalog"
     assert "no star within" in told.reasons[0]
-    assert "wpdc catalog prepare gaia --around" in told.advice[0]
+    assert "its nearest star is 20 deg away" in told.reasons[0]
+    assert "--wcs HEADER" in told.advice[0]
+    assert "wpdc catalog prepare gaia --around" in told.advice[1]
     draw_explanation(told)
 
 
@@ -103,6 +105,10 @@ def test_results_in_a_notebook(solved):
         html = result._repr_html_()
         assert html == as_html(result)
         assert html.startswith("<table><caption>")
+    for result in (calibration, solution, solved, *solved.cameras):
+        assert repr(result).startswith(f"<{type(result).__name__}\n")
+        assert len(repr(result)) < 1000
+        assert all(text in repr(result) for _, text in describe(result))
     lines = dict(describe(calibration))
     assert lines["frame"] == "sim-01, solved"
     assert f"{calibration.statistics['n_used']} of" in lines["stars"]
@@ -179,7 +185,7 @@ def test_what_cannot_be_shown(folder, capsys, arguments, message):
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("what", ["scale", "pointing", "references", "sources", "flat"])
+@pytest.mark.parametrize("what", ["scale", "pointing", "references", "sources", "faint", "flat"])
 def test_advice_is_that_of_the_case(sky, what):
     """What would have helped, or what is missing: not a search in other directions."""
     frame, stars = sky.exposures[0].frame(), sky.reference
@@ -200,7 +206,13 @@ def test_advice_is_that_of_the_case(sky, what):
     elif what == "sources":
         few = frame.load_sources()[:4]
         frame = replace(frame, load_sources=few.copy)
-        expected = "8 sources are needed, 4 can be used: use fainter ones .*--solution"
+        expected = "8 sources are needed, 4 can be used: solve it with .*--solution"
+    elif what == "faint":
+        few = frame.load_sources()[:10]
+        few["snr"] = np.where(np.arange(10) < 4, 50.0, 7.0)
+        frame = replace(frame, load_sources=few.copy)
+        # A list has no other threshold.
+        expected = r"4 can be used: use fainter ones \(--min-snr 5\), or solve it with .*--solution"
     else:
         image = partial(np.full, frame.image_shape, 100.0)
         frame = replace(frame, load_sources=None, load_image=image)
@@ -262,7 +274,10 @@ def test_the_command_tells_stages_status_and_advice(tmp_path, capsys):
     assert run(["explain", frame, "--catalog", catalogs[1]]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert "sim-01: failed" in lines
-    assert any(line.startswith("try: use a catalog of this part of the sky: ") for line in lines)
+    assert any(
+        line.startswith("try: if it is right, use a catalog of this part of the sky: ")
+        for line in lines
+    )
     assert run(["explain", frame, "--catalog", catalogs[0], "--output", str(picture)]) == 2
     assert run(["explain", frame, "--catalog", catalogs[0], "--output", "why.txt"]) == 2
     assert "must end with .png, .pdf or .svg" in capsys.readouterr().err

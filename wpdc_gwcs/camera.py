@@ -10,14 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wpdc_gwcs.description import Described
 from wpdc_gwcs.frozen import freeze_attributes, frozen_array
 from wpdc_gwcs.models import deproject, project
 
 __all__ = ["Camera", "build_camera"]
 
 
-@dataclass(frozen=True, eq=False)
-class Camera:
+@dataclass(frozen=True, eq=False, repr=False)
+class Camera(Described):
     """Detectors that were solved together.
 
     Parameters
@@ -79,11 +80,6 @@ class Camera:
         freeze_attributes(self, "learned", "files", "solutions", "provenance")
         if self.reference not in self.detectors:
             raise ValueError(f"reference must be one of the detectors, got {self.reference!r}")
-
-    def _repr_html_(self):
-        from wpdc_gwcs.description import as_html
-
-        return as_html(self)
 
     def focal_plane(self, detector, x, y):
         """Return the focal plane position of pixels of a detector.

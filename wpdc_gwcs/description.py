@@ -6,7 +6,10 @@ import numpy as np
 
 from wpdc_gwcs.counts import counted
 
-__all__ = ["as_html", "describe"]
+__all__ = ["Described", "as_html", "describe"]
+
+# Frames of a run that are named.
+_MOST_FRAMES = 50
 
 
 def describe(result):
@@ -45,6 +48,19 @@ def describe(result):
     if hasattr(result, "pv"):
         return _of_solution(result)
     raise TypeError(f"cannot describe a {type(result).__name__}")
+
+
+class Described:
+    """Result that shows itself in words, because its arrays would fill the screen."""
+
+    def __repr__(self):
+        lines = describe(self)
+        width = max(len(label) for label, _ in lines)
+        words = [f"    {label:{width}}  {text}" for label, text in lines]
+        return "\n".join([f"<{type(self).__name__}", *words]) + ">"
+
+    def _repr_html_(self):
+        return as_html(self)
 
 
 def as_html(result):
@@ -144,13 +160,15 @@ def _of_run(run):
     states = [str(status) for status in run.summary["status"]]
     counts = ", ".join(f"{states.count(s)} {s}" for s in dict.fromkeys(states))
     lines = [("run", f"{run.run_id}: {counted(len(states), 'frame')}, {counts}")]
-    for row in run.summary:
+    for row in run.summary[:_MOST_FRAMES]:
         sigma = np.hypot(float(row["sigma_dx"].value), float(row["sigma_dy"].value)) / np.sqrt(2)
         stars = counted(row["n_matched"], "star")
         good = f"{stars}, {sigma:.4f} px, {float(row['rms_mas'].value):.2f} mas"
         reason = str(row["reason"])
         parts = [str(row["status"]), good if row["n_matched"] else "", reason]
         lines.append((str(row["frame"]), "; ".join(part for part in parts if part)))
+    if len(run.summary) > _MOST_FRAMES:
+        lines.append(("...", f"{len(run.summary) - _MOST_FRAMES} more frames: see its summary"))
     for name, solution in run.solutions.items():
         lines.append((name, dict(_of_solution(solution)).get("distortion", "")))
     return lines

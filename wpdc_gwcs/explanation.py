@@ -105,7 +105,7 @@ class _Story:
     def __init__(self, frame, settings):
         self.frame, self.settings = frame, settings
         self.stages, self.advice, self.found = [], [], {}
-        self.in_reach = 0
+        self.in_reach, self.has_fainter = 0, True
 
     def tell(self, name, *lines, went_well=True):
         self.stages.append(Stage(name, bool(went_well), tuple(lines)))
@@ -177,10 +177,13 @@ def explain_frame(frame, catalog, settings=None):
         reference = reference_in_reach(frame, stars, start, settings)
     except MatchError as error:
         story.advice.append(
-            f"use a catalog of this part of the sky: wpdc catalog prepare gaia --around "
-            f"{shlex.quote(frame.source)} --output gaia.fits"
+            "if the header points elsewhere, give another one: --wcs HEADER"
+            + (", with the right ascension in degrees" if "in hours" in str(error) else "")
         )
-        story.advice.append("or give another header, if this one points elsewhere (--wcs HEADER)")
+        story.advice.append(
+            "if it is right, use a catalog of this part of the sky: wpdc catalog prepare gaia "
+            f"--around {shlex.quote(frame.source)} --output gaia.fits"
+        )
         return story.fail("catalog", error, f"{counted(len(stars), 'star')} read from the catalog")
     _tell_catalog(story, stars, reference, start)
     try:
@@ -221,19 +224,21 @@ def _tell_sources(story, sources):
     rules = rules_of(sources, story.frame, story.settings)
     usable = ~np.any(list(rules.values()), axis=0)
     story.found |= {"sources": sources, "usable": usable}
+    # There are always fainter stars on an image.
+    listed = any(out.any() for name, out in rules.items() if name.startswith("below S/N"))
+    story.has_fainter = listed or story.frame.load_image is not None
     lines = tell_sources(sources, story.frame, story.settings)
     story.tell("sources", *lines, went_well=usable.sum() >= _FEW)
     if usable.sum() < _PLENTY:
-        options = {
-            "not round": "--max-roundness",
-            "faint": "--min-snr",
-            "saturated": "--saturation",
-        }
+        options = {"not round": "--max-roundness", "below S/N": "--min-snr"}
+        if story.frame.load_image is not None:
+            # A list has been measured already.
+            options |= {"saturated": "--saturation", "": "--threshold"}
         worst = max(rules, key=lambda name: rules[name].sum())
-        option = next((o for word, o in options.items() if word in worst), "--threshold")
+        option = next((o for word, o in options.items() if word in worst), None)
         if rules[worst].any():
-            n = int(rules[worst].sum())
-            story.advice.append(f"{counted(n, 'source')} left out as {worst}: see {option}")
+            n, see = int(rules[worst].sum()), "" if option is None else f": see {option}"
+            story.advice.append(f"{counted(n, 'source')} left out as {worst}{see}")
     return usable
 
 
@@ -333,9 +338,11 @@ def _advise_on_match(story, stars, sources, error):
             f"{_FEW} reference stars are needed, and the catalog has {story.in_reach} in reach"
         )
     elif n < _FEW:
+        faint = "--min-snr 5" if story.frame.load_image is None else "--threshold 3 --min-snr 5"
+        more = f"use fainter ones ({faint}), or " if story.has_fainter else ""
         story.advice.append(
-            f"{_FEW} sources are needed, {n} can be used: use fainter ones (--threshold 3 "
-            "--min-snr 5), or solve it with the other detectors of its camera, or with a --solution"
+            f"{_FEW} sources are needed, {n} can be used: {more}solve it with the other detectors "
+            "of its camera, or with a --solution"
         )
     else:
         _try_otherwise(story, stars, sources)

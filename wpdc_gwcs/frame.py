@@ -13,7 +13,7 @@ __all__ = ["Frame"]
 _UNFIT = re.compile(r"[/\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Frame:
     """One exposure of one detector: image or source list, with WCS and epoch of its header.
 
@@ -112,3 +112,8 @@ class Frame:
             )
         object.__setattr__(self, "image_shape", shape)
         freeze_attributes(self, "meta")
+
+    def __repr__(self):
+        ny, nx = self.image_shape
+        kind = "source list" if self.load_image is None else "image"
+        return f"<Frame {self.name}: {kind} of {nx} x {ny} px, detector {self.detector}>"

@@ -14,6 +14,7 @@ import numpy as np
 from astropy import units as u
 from scipy.interpolate import RegularGridInterpolator
 
+from wpdc_gwcs.description import Described
 from wpdc_gwcs.export.memory import InMemory
 from wpdc_gwcs.frozen import freeze_attributes, freeze_models, frozen_array
 from wpdc_gwcs.models import LookupTable, PVPolynomial, deproject
@@ -61,8 +62,8 @@ def _freeze_sigma(owner, name):
         raise ValueError(f"{name} must be standard deviations on 2 x 2 nodes at least")
 
 
-@dataclass(frozen=True, eq=False)
-class DistortionSolution(InMemory):
+@dataclass(frozen=True, eq=False, repr=False)
+class DistortionSolution(Described, InMemory):
     """The distortion of one detector, which all its exposures share.
 
     Parameters
@@ -146,11 +147,6 @@ class DistortionSolution(InMemory):
         # Copies of models are mutable, but not those in copies of results.
         self.__dict__.update(state)
         freeze_models(self, "pv", "lookup_table")
-
-    def _repr_html_(self):
-        from wpdc_gwcs.description import as_html
-
-        return as_html(self)
 
     def holds_at(self, epoch):
         """Return whether the solution is valid at an epoch.
@@ -274,8 +270,8 @@ def _evaluate(function, first, second, unit):
     return first.item(), second.item()
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration(InMemory):
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Described, InMemory):
     """One calibrated frame: an instrument and the attitude of one exposure.
 
     Parameters
@@ -340,11 +336,6 @@ class Calibration(InMemory):
         frozen_array(self, "color_shift", shape=(2, 3))
         freeze_attributes(self, "statistics", "settings", "provenance")
         freeze_models(self, "field")
-
-    def _repr_html_(self):
-        from wpdc_gwcs.description import as_html
-
-        return as_html(self)
 
     def __getstate__(self):
         # Compiled functions are not pickled; they are created again when needed.

@@ -70,8 +70,9 @@ def check_solution(frame, calibration, *, stored=None, known=False):
     Raises
     ------
     FitError
-        If too few stars agree with the solution, or their residuals scatter far more than their
-        errors or than the residuals of the stored solution.
+        If too few stars agree with the solution, if its map folds, so that two pixels have the same
+        position, or if the residuals scatter far more than their errors or than the residuals of
+        the stored solution.
 
     Notes
     -----
@@ -84,6 +85,12 @@ def check_solution(frame, calibration, *, stored=None, known=False):
         raise FitError(
             f"{frame.source}: only {counted(statistics['n_used'], 'star')} could be fitted; at "
             f"least {least} are needed"
+        )
+    low, high = calibration.solution.area_range
+    if not low > 0:
+        raise FitError(
+            f"{frame.source}: the map folds, it changes the area of pixels by factors of {low:.2f} "
+            f"to {high:.2f}: its {counted(statistics['n_used'], 'star')} do not determine it"
         )
     used = np.asarray(calibration.matches["used"])
     sigma = max(residuals["sigma_dx"], residuals["sigma_dy"])

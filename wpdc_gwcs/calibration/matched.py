@@ -24,6 +24,7 @@ from wpdc_gwcs.catalogs import (
     scale_errors,
     select_cone,
 )
+from wpdc_gwcs.catalogs.cone import separations
 from wpdc_gwcs.columns import numbers_or_none
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.matching import match_planes
@@ -344,7 +345,41 @@ def catalog_of_frame(frame, catalog, settings, *, solution=None):
     `~astropy.table.Table`
         Rows from which `match_frame` selects the same stars as from the whole catalog.
     """
-    return select_cone(catalog, *_reach(frame, _start(frame, solution), settings))
+    reach = _reach(frame, _start(frame, solution), settings)
+    near = select_cone(catalog, *reach)
+    # Without stars, those that tell what is wrong.
+    return near if len(near) else catalog[_elsewhere(catalog, *reach)]
+
+
+def _elsewhere(catalog, ra, dec, radius):
+    """Rows of the star nearest to a position, and to that with right ascension read as hours."""
+    if not len(catalog):
+        return []
+    rows = [int(np.argmin(separations(catalog, ra, dec)))]
+    if ra < 24.0:
+        distance = separations(catalog, 15.0 * ra, dec)
+        if distance.min() <= radius:
+            rows.append(int(np.argmin(distance)))
+    return rows
+
+
+def _tell_elsewhere(catalog, ra, dec, radius):
+    """Say where the stars of a catalog without any near a position are."""
+    rows = _elsewhere(catalog, ra, dec, radius)
+    if not rows:
+        return ""
+    star = catalog[rows[0]]
+    distance = separations(catalog, ra, dec, rows)[0]
+    if distance <= radius:
+        # It is there, but fainter than the limit.
+        return ""
+    text = (
+        f"; its nearest star is {distance:.3g} deg away, at RA {star['ra']:.4f} "
+        f"Dec {star['dec']:.4f}"
+    )
+    if len(rows) > 1:
+        text += f"; it has stars at RA {15.0 * ra:.4f}: is the right ascension in hours"
+    return text
 
 
 def reference_in_reach(frame, catalog, start, settings):
@@ -379,7 +414,7 @@ def reference_in_reach(frame, catalog, start, settings):
     if len(near) == 0:
         raise MatchError(
             f"{frame.source}: the catalog has no star within {radius:.3f} deg of the frame's "
-            f"center, RA {ra:.4f} Dec {dec:.4f} deg"
+            f"center, RA {ra:.4f} Dec {dec:.4f} deg{_tell_elsewhere(catalog, ra, dec, radius)}"
         )
     near = scale_errors(near)
     return near if frame.epoch is None else propagate(near, frame.epoch, parallax=True)

@@ -38,6 +38,7 @@ from wpdc_gwcs.catalogs import (
     split_extension,
 )
 from wpdc_gwcs.counts import counted
+from wpdc_gwcs.description import Described
 from wpdc_gwcs.exceptions import (
     CatalogError,
     ClusterError,
@@ -62,8 +63,8 @@ _FRAMES_PER_SEARCH = 100
 _MOST_SOLVING = 1000
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationRun:
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibrationRun(Described):
     """The results of a call of `calibrate`.
 
     Parameters
@@ -111,11 +112,6 @@ class CalibrationRun:
     def __post_init__(self):
         names = ("calibrations", "solutions", "failures", "superseded", "cameras", "resumed")
         freeze_attributes(self, *names)
-
-    def _repr_html_(self):
-        from wpdc_gwcs.description import as_html
-
-        return as_html(self)
 
 
 @one_blas_thread

@@ -6,11 +6,13 @@
 """
 
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 from astropy.table import Table
 
 from wpdc_gwcs.calibration.matched import FailedFrame, sky_of_frame
@@ -19,9 +21,14 @@ from wpdc_gwcs.calibration.settings import Settings
 from wpdc_gwcs.calibration.story import say, tell_catalog
 from wpdc_gwcs.calibration.workers import Task, stored_of, without_maps
 from wpdc_gwcs.catalogs import Region, fill_motions, read_catalog
-from wpdc_gwcs.exceptions import MatchError
+from wpdc_gwcs.counts import counted
+from wpdc_gwcs.exceptions import MatchError, WPDCWarning
 
 __all__ = ["InWork", "Run", "begin_group", "match_group", "sky_of_frames"]
+
+# Years from the epoch of the catalog from which on a wrong date is more likely than an old plate,
+# and where proper motions of 1 mas / yr matter anyway.
+_FAR_EPOCH = 50.0
 
 
 def sky_of_frames(frames, settings, solution):
@@ -148,7 +155,25 @@ def begin_group(group, run, workers, other):
     if other:
         return InWork(group, None, {})
     catalog = run.catalog_of(group)
+    _warn_of_epochs(group, catalog)
     return InWork(group, catalog, _submit(group, catalog, run, workers, narrow=True))
+
+
+def _warn_of_epochs(group, catalog):
+    """Warn of frames so far from the epoch of the catalog that the date may be wrong."""
+    if not {"pmra", "ref_epoch"} <= set(catalog.colnames) or not len(catalog):
+        return
+    middle = float(np.median(catalog["ref_epoch"]))
+    far = [f for f in group if f.epoch is not None and abs(f.epoch - middle) > _FAR_EPOCH]
+    if far:
+        first = far[0]
+        others = "" if len(far) == 1 else f" and {counted(len(far) - 1, 'other frame')}"
+        warnings.warn(
+            f"{first.source}{others}: the epoch {first.epoch:.2f} is "
+            f"{abs(first.epoch - middle):.0f} years from that of the catalog, {middle:.2f}: check "
+            "the date in the header, or give it with --epoch",
+            WPDCWarning,
+        )
 
 
 def _submit(group, catalog, run, workers, *, narrow, sources=None):

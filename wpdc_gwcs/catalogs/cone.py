@@ -2,7 +2,7 @@
 
 import numpy as np
 
-__all__ = ["select_cone"]
+__all__ = ["select_cone", "separations"]
 
 
 def select_cone(catalog, ra, dec, radius):
@@ -35,17 +35,32 @@ def select_cone(catalog, ra, dec, radius):
             "the cone needs a finite center and a radius >= 0, "
             f"got ra={ra}, dec={dec}, radius={radius}"
         )
-    all_dec = np.asarray(catalog["dec"], float)
     # A cut in declination leaves few stars for the trigonometry.
-    near = np.flatnonzero(np.abs(all_dec - dec) <= radius)
-    near_ra, near_dec = (
-        np.radians(np.asarray(catalog["ra"], float)[near]),
-        np.radians(all_dec[near]),
-    )
-    # Haversine, which keeps its accuracy at small separations.
-    h = (
-        np.sin(0.5 * (near_dec - np.radians(dec))) ** 2
-        + np.cos(near_dec) * np.cos(np.radians(dec)) * np.sin(0.5 * (near_ra - np.radians(ra))) ** 2
-    )
-    inside = h <= np.sin(np.radians(min(radius, 180.0)) / 2) ** 2 * (1 + 1e-12)
+    near = np.flatnonzero(np.abs(np.asarray(catalog["dec"], float) - dec) <= radius)
+    inside = separations(catalog, ra, dec, near) <= min(radius, 180.0) * (1 + 1e-12)
     return catalog[near[inside]]
+
+
+def separations(catalog, ra, dec, rows=slice(None)):
+    """Compute the distances of stars from a position.
+
+    Parameters
+    ----------
+    catalog : `~astropy.table.Table`
+        As returned by `read_catalog`.
+    ra, dec : float
+        Position, deg.
+    rows : index, optional
+        Which stars; default all.
+
+    Returns
+    -------
+    (N,) ndarray
+        Deg.
+    """
+    at_ra, at_dec = (np.radians(np.asarray(catalog[c], float)[rows]) for c in ("ra", "dec"))
+    ra, dec = np.radians([ra, dec])
+    # Haversine, which keeps its accuracy at small separations.
+    h = np.sin(0.5 * (at_dec - dec)) ** 2
+    h += np.cos(at_dec) * np.cos(dec) * np.sin(0.5 * (at_ra - ra)) ** 2
+    return np.degrees(2 * np.arcsin(np.sqrt(np.minimum(h, 1.0))))

@@ -105,8 +105,9 @@ _OF_COMMANDS = (
 # Reasons of failed frames, and hints.
 _EXPLAIN = "wpdc explain {frame} --catalog {catalog}{wcs}{picture}"
 _OF_FRAMES = (
-    (r".*the catalog has no star within", "wpdc catalog prepare gaia --around {frame} --output "
-     "gaia.fits"),
+    (r".*is the right ascension in hours", "--wcs HEADER, with the right ascension in degrees"),
+    (r".*the catalog has no star within", "--wcs HEADER if the header is wrong, or a catalog of "
+     "this field: wpdc catalog prepare gaia --around {frame} --output gaia.fits"),
     (r".*too few reference stars", "a deeper catalog: wpdc catalog prepare gaia --around {frame} "
      "--output gaia.fits"),
     (r".*of (?:different|another) shapes?|.*the frame has shape", "a run of its own for frames of "
