@@ -30,6 +30,7 @@ from wpdc_gwcs.models import (
     pv_terms,
 )
 from wpdc_gwcs.wcs import DetectorWCS, build_wcs, sky_map, to_stock_wcs
+from wpdc_gwcs.wcs import stock as stock_module
 
 NX, NY = 9216, 9232
 SCALE = 0.074 / 3600
@@ -627,6 +628,21 @@ def test_stock_wcs_without_a_range_or_an_inverse():
         _ = stock.get_transform("detector", "undistorted").inverse
     with pytest.raises(ValueError, match="wcs must consist of the steps"):
         to_stock_wcs(stock)
+
+
+def test_stock_forms_of_a_camera_are_made_once_for_each_detector(monkeypatch):
+    """The frames of a camera come exposure by exposure, each with its own attitude."""
+    made, inverse = [], stock_module._stock_inverse
+    monkeypatch.setattr(stock_module, "_stock_inverse", lambda *a: made.append(a) or inverse(*a))
+    stock_module._pickled_model.cache_clear()
+    for roll in (0.0, 0.3):
+        for seed in (3, 4, 5):
+            wcs = camera_wcs(roll=roll, seed=seed, shape=(300, 200), corner=5.0)
+            stock = to_stock_wcs(wcs)
+            assert_allclose(stock(10.0, 250.0), wcs(10.0, 250.0), rtol=0, atol=1e-12)
+            back = stock.invert(*wcs(10.0, 250.0), with_bounding_box=False)
+            assert_allclose(back, (10.0, 250.0), rtol=0, atol=1e-4)
+    assert len(made) == 3
 
 
 # --- whole images

@@ -1,6 +1,8 @@
 """Conversion of a WCS to stock astropy models."""
 
 import pickle
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from astropy.modeling.models import (
@@ -86,15 +88,23 @@ def to_stock_wcs(wcs):
     return stock
 
 
-# The last first step, pickled, and its input: all frames of a detector share it, and its inverse
-# takes a while.  Unpickling takes half the time of a copy.
-_last_first_step = (None, None)
+# Detectors whose first step is kept: all frames of a detector share it, its inverse takes a while,
+# and the frames of a camera come exposure by exposure.
+_KEPT = 64
+
+
+@dataclass(frozen=True)
+class _FirstStep:
+    """First step of the WCS of a detector, equal to others of the same content."""
+
+    content: bytes
+    distortion: DistortionCorrection = field(compare=False)
+    image_shape: tuple = field(compare=False)
 
 
 def _stock_first_step(distortion, image_shape):
-    global _last_first_step
     table = distortion.lookup_table
-    made_of = pickle.dumps(
+    content = pickle.dumps(
         (
             distortion.parameters,
             (distortion.pv.degree, distortion.pv.radial, distortion.pv.parameters),
@@ -102,14 +112,18 @@ def _stock_first_step(distortion, image_shape):
             image_shape,
         )
     )
-    if _last_first_step[0] != made_of:
-        model = _stock_distortion(distortion)
-        inverse = _stock_inverse(distortion, image_shape)
-        if inverse is not None:
-            model.inverse = inverse
-        model.name = "distortion_correction"
-        _last_first_step = (made_of, pickle.dumps(model))
-    return pickle.loads(_last_first_step[1])
+    # Unpickling takes half the time of a copy.
+    return pickle.loads(_pickled_model(_FirstStep(content, distortion, image_shape)))
+
+
+@lru_cache(_KEPT)
+def _pickled_model(step):
+    model = _stock_distortion(step.distortion)
+    inverse = _stock_inverse(step.distortion, step.image_shape)
+    if inverse is not None:
+        model.inverse = inverse
+    model.name = "distortion_correction"
+    return pickle.dumps(model)
 
 
 def stock_polynomial(coefficients):
