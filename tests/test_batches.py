@@ -4,6 +4,7 @@ import gc
 import json
 import os
 import pickle
+import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -21,6 +22,8 @@ from wpdc_gwcs.calibration.batches import batches_of
 from wpdc_gwcs.calibration.journal import add_to_journal, find_journals, journal_of, read_journal
 from wpdc_gwcs.calibration.manifest import read_manifest
 from wpdc_gwcs.calibration.results import ResultFolder
+from wpdc_gwcs.calibration.solving import Batch
+from wpdc_gwcs.calibration.workers import Task, Workers
 from wpdc_gwcs.cli.app import run as command
 from wpdc_gwcs.cli.inputs import expand_paths
 from wpdc_gwcs.exceptions import CatalogError, ClusterError, InputError, without_frames
@@ -245,7 +248,8 @@ class Pool(ThreadPoolExecutor):
         self.largest = 0
 
     def submit(self, function, item):
-        self.largest = max(self.largest, len(pickle.dumps(item)))
+        if isinstance(item, Batch | Task):
+            self.largest = max(self.largest, len(pickle.dumps(item)))
         if function is not solving_module.solve_or_fail:
             return super().submit(function, item)
         self.n_solved += 1
@@ -305,6 +309,21 @@ def test_batches_are_solved_by_processes(inputs, pairs, tmp_path, alone, monkeyp
     monkeypatch.setattr(solving_module, "_solve", None)  # of this process
     run = calibrate(frames, reference, solution=stored, output=tmp_path, jobs=2, keep=False)
     the_same(run, tmp_path, alone)
+
+
+def test_the_end_of_workers_cancels_what_they_have_not_begun():
+    with Pool() as pool:
+        with Workers(1, pool) as workers:
+            until = threading.Event()
+            futures = [workers.start(wait_for, until) for _ in range(2)]
+            futures += [workers.start(wait_for, until) for _ in range(5)]
+        assert all(future.cancelled() for future in futures[2:])
+        until.set()
+    assert all(future.result() for future in futures[:2])
+
+
+def wait_for(event):
+    return event.wait(10.0)
 
 
 def test_what_is_kept_is_solved_here(inputs, pairs, tmp_path):

@@ -215,7 +215,8 @@ class Workers:
 
     def __exit__(self, *_):
         self._closed = True
-        for future in self._futures:
+        # A copy: a future that is canceled leaves the set.
+        for future in list(self._futures):
             future.cancel()
         for process in list(self._processes):
             process.end()
