@@ -99,6 +99,7 @@ _OF_COMMANDS = (
         "dask worker {path}, on machines that see the files",
     ),
     (r"--scheduler .*: no Dask scheduler", "dask scheduler, which prints its address"),
+    (r"a distortion of .* is not invertible", "a smaller --distortion, or a larger --size"),
     (r".*would both write", "different names, or one run for each of them"),
     (r"exposure .*left out|all \d+ exposures were left out", "wpdc explain FRAME --catalog CAT"),
 )
