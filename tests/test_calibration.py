@@ -88,7 +88,7 @@ def test_summary_has_a_row_per_frame(run):
         "n_pairs", "n_ambiguous", "expected_by_chance", "purity", "completeness", "significance",
         "mean_dx", "sigma_dx", "mean_dy", "sigma_dy", "holdout_sigma_dx", "holdout_sigma_dy",
         "rms_mas", "seconds", "fwhm", "ellipticity", "mismatch", "gain", "noise", "left_out",
-        "epoch",
+        "epoch", "header_offset", "header_rotation",
     ]  # fmt: skip
     assert list(run.summary["status"]) == ["solved"] * 3
     assert np.all(run.summary["sigma_dx"].to_value("pix") < 0.08)
@@ -178,6 +178,28 @@ def test_catalogue_of_another_part_of_the_sky(simulation, catalog):
     with pytest.raises(MatchError) as again:
         match_frame(frame, part)
     assert str(again.value) == str(info.value)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_summary_says_how_far_the_header_is_off(simulation, catalog, sign):
+    """Of 40 and 30 px, and half a degree, about the center of the detector."""
+    frame = simulation.exposures[0].frame()
+    truth = simulation.exposures[0].sky
+    header, angle = WCS(naxis=2), np.radians(0.5 * sign)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    header.wcs.ctype = "RA---TAN", "DEC--TAN"
+    header.wcs.crpix = 512.0 - 40.0, 512.0 + 30.0
+    header.wcs.crval = truth(511.5, 511.5)
+    x, y = 511.5 + 100.0 * np.array([[0, 1, -1, 0, 0], [0, 0, 0, 1, -1]])
+    offset = SkyCoord(*header.wcs.crval, unit="deg").spherical_offsets_to(
+        SkyCoord(*truth(x, y), unit="deg")
+    )
+    xi, eta = (o.deg for o in offset)
+    cd = np.array([[xi[1] - xi[2], xi[3] - xi[4]], [eta[1] - eta[2], eta[3] - eta[4]]]) / 200.0
+    header.wcs.cd = cd @ turn
+    row = calibrate(replace(frame, wcs=header), catalog).summary[0]
+    assert row["header_offset"].to_value("pix") == pytest.approx(50.0, abs=0.1)
+    assert row["header_rotation"].to_value("deg") == pytest.approx(0.5 * sign, abs=0.02)
 
 
 def test_right_ascension_in_hours(simulation, catalog):

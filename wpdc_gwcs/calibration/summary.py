@@ -4,10 +4,15 @@ import numpy as np
 from astropy.table import QTable
 
 from wpdc_gwcs.calibration.measure import quality_of
+from wpdc_gwcs.calibration.start import detector_center, sky_of
+from wpdc_gwcs.models import project
 
-__all__ = ["summarize", "summary_row"]
+__all__ = ["header_error", "summarize", "summary_row"]
 
-_UNITS = {"rms_mas": "mas", "seconds": "s", "fwhm": "pix", "epoch": "yr"}
+_UNITS = {
+    "rms_mas": "mas", "seconds": "s", "fwhm": "pix", "epoch": "yr",
+    "header_offset": "pix", "header_rotation": "deg",
+}  # fmt: skip
 
 
 def summary_row(frame, result, calibration, failure, settings):
@@ -59,7 +64,45 @@ def summary_row(frame, result, calibration, failure, settings):
     row["seconds"] = statistics.get("seconds", result.seconds)
     epoch = np.nan if frame.epoch is None else float(frame.epoch)
     counts = getattr(result, "left_out", None)
-    return row | quality_of(frame, result.sources, settings, counts=counts) | {"epoch": epoch}
+    row |= quality_of(frame, result.sources, settings, counts=counts) | {"epoch": epoch}
+    offset, rotation = np.nan, np.nan
+    if calibration is not None:
+        offset, rotation = header_error(frame.wcs, calibration)
+    return row | {"header_offset": offset, "header_rotation": rotation}
+
+
+def header_error(wcs, calibration):
+    """Measure how far the WCS of a header is off.
+
+    Parameters
+    ----------
+    wcs : object
+        WCS of the header, with ``pixel_to_world_values``.
+    calibration : Calibration
+        Calibration of the frame.
+
+    Returns
+    -------
+    offset : float
+        Distance at the center of the detector, px.
+    rotation : float
+        Degrees, counterclockwise in pixels from the calibration to the header.
+    """
+    shape = calibration.solution.image_shape
+    # The center, and points around it that tell the rotation of the whole detector.
+    quarter = np.array(shape[::-1]) / 4
+    step = np.array([[0, 1, -1, 0, 0], [0, 0, 0, 1, -1]]) * quarter[:, None]
+    x, y = detector_center(shape)[:, None] + step
+    true = calibration.wcs(x, y)
+    center = [c[0] for c in true]
+    there, here = (np.array(project(*sky, center)) for sky in (sky_of(wcs, x, y), true))
+    shift = np.linalg.solve(calibration.cd, there[:, 0] - here[:, 0])
+    axes = [plane[:, [1, 3]] - plane[:, [2, 4]] for plane in (here, there)]
+    turn = np.linalg.solve(*axes)
+    # In px of equal size along both axes.
+    turn = np.diag(quarter) @ turn @ np.diag(1 / quarter)
+    rotation = np.degrees(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
+    return float(np.hypot(*shift)), float(rotation)
 
 
 def summarize(rows, run_id):

@@ -25,8 +25,11 @@ _IMPORTANT = {
     "holdout_sigma_dx": ("held out dx", "sigma, px"),
     "holdout_sigma_dy": ("held out dy", "sigma, px"),
     "rms_mas": ("rms", "mas"),
+    "header_offset": ("header off", "px"),
+    "header_rotation": ("header turned", "deg"),
     "reason": ("reason", None),
 }
+_DIGITS = {"rms_mas": 2, "header_offset": 1, "header_rotation": 3}
 _TEXTS = {"frame", "detector", "status", "reason", "camera", "exposure"}
 # Field of ResidualStatistics and heading of its column.
 _STATISTICS = {
@@ -269,7 +272,7 @@ def _summary_table(summary, ids):
             {
                 "status": str(row["status"]),
                 "link": ids.get(str(row["frame"])),
-                "cells": [_cell(row[n], 2 if n == "rms_mas" else 4) for n in names],
+                "cells": [_cell(row[n], _DIGITS.get(n, 4)) for n in names],
             }
             for row in summary
         ],
