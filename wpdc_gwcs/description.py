@@ -6,7 +6,10 @@ import numpy as np
 
 from wpdc_gwcs.counts import counted
 
-__all__ = ["as_html", "describe"]
+__all__ = ["as_html", "as_text", "describe"]
+
+# Width of the labels, if all are this short.
+_LABEL = 11
 
 
 def describe(result):
@@ -66,6 +69,30 @@ def as_html(result):
         for label, text in describe(result)
     )
     return f"<table><caption>{type(result).__name__}</caption>{rows}</table>"
+
+
+def as_text(lines):
+    r"""Align labels and texts in two columns.
+
+    Parameters
+    ----------
+    lines : list of (str, str)
+        Labels and texts, as from `describe`.
+
+    Returns
+    -------
+    list of str
+        One line each; the texts begin below each other, however long a label is.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.description import as_text
+    >>> print(*as_text([("frame", "solved"), ("csst-msc-01-g-1", "failed")]), sep="\n")
+    frame           solved
+    csst-msc-01-g-1 failed
+    """
+    width = max([_LABEL, *(len(label) for label, _ in lines)])
+    return [f"{label:<{width}} {text}" for label, text in lines]
 
 
 def _of_calibration(calibration):

@@ -57,6 +57,9 @@ _FOREIGN = (
 )
 # Tables that can be read: HDF5, Parquet, text in UTF-16.
 _TABLES = (b"\x89HDF", b"PAR1", b"\xff\xfe", b"\xfe\xff")
+# Text that is no table: JSON, and the manifest of a run, whose first entry is its name.
+_MANIFEST = re.compile(rb'\s*\{\s*"run"\s*:')
+_JSON = re.compile(rb'\s*(\{\s*["}]|\[\s*["{\[])')
 # No other text begins with control characters other than blanks; headers may be padded with zeros.
 _CONTROL = re.compile(rb".{0,7}\0|.*[\x01-\x08\x0e-\x1f\x7f]", re.DOTALL)
 _FITS_NAME = re.compile(r"\.(fits?|fts|fz)(\.(gz|bz2|xz))?$", re.IGNORECASE)
@@ -212,6 +215,8 @@ def _foreign(start):
     if start.startswith(_TABLES):
         return None
     known = next((what for magic, what in _FOREIGN if start.startswith(magic)), None)
+    if known is None and _JSON.match(start):
+        known = "a JSON file, the manifest of a run" if _MANIFEST.match(start) else "a JSON file"
     return known or ("another binary file" if _CONTROL.match(start) else None)
 
 
