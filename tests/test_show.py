@@ -228,6 +228,61 @@ def test_arrows_end_inside_the_axes(folder):
         assert place + height < figure.bbox.height
 
 
+def text_of(path):
+    return "\n".join(" ".join(line) for line in contents_of(str(path)).lines)
+
+
+def test_an_image_and_the_origin_of_its_wcs(folder, sky, tmp_path):
+    from wpdc_gwcs import read
+    from wpdc_gwcs.io.embed import write_into
+
+    image, pixels = folder / "sim-01.fits", sky.exposures[0].render()
+    scale = np.sqrt(abs(np.linalg.det(sky.exposures[0].linear_wcs.wcs.cd))) * 3600
+    told = text_of(image)
+    assert f"{scale:.3g} arcsec / px" in told
+    assert f"{512 * scale / 60:.3g} arcmin x {512 * scale / 60:.3g} arcmin" in told
+    assert "RA---TAN, DEC--TAN" in told
+    assert "wpdc_gwcs" not in told
+    calibration = read(next((folder / "run").glob("*.wcs.asdf")))
+    write_into(calibration, image, form="tpv", output=tmp_path / "out.fits")
+    told = text_of(tmp_path / "out.fits")
+    assert "RA---TPV, DEC--TPV" in told
+    assert "WCS by wpdc_gwcs" in told
+    assert " as tpv, good to " in told
+    # A detector without a name has none, instead of the word for it.
+    header = sky.exposures[0].header.copy()
+    assert "detector sim" in text_of(image)
+    del header["DETECTOR"]
+    fits.writeto(tmp_path / "unnamed.fits", pixels, header)
+    assert "detector" not in text_of(tmp_path / "unnamed.fits")
+
+
+def test_a_list_of_sources(folder, sky):
+    told = text_of(folder / "sim-02.ldac")
+    n = len(fits.getdata(folder / "sim-02.ldac", "LDAC_OBJECTS"))
+    assert f"none of {n} sources left out by default" in told
+    assert "columns used: x, y, x_err, y_err, flux, snr" in told
+
+
+def test_weight_maps_and_masks_are_no_images_of_stars(folder, tmp_path):
+    header = fits.getheader(folder / "sim-01.fits")
+    weight = np.ones((512, 512), np.float32)
+    weight[:128] = 0
+    fits.writeto(tmp_path / "sim-01.weight.fits", weight, header)
+    assert "image none beside it" in text_of(tmp_path / "sim-01.weight.fits")
+    shutil.copy(folder / "sim-01.fits", tmp_path)
+    fits.writeto(tmp_path / "bad_mask.fits", (weight == 0).astype(np.int16))
+    told = text_of(tmp_path / "sim-01.weight.fits")
+    assert "weight map of 512 x 512 px" in told
+    assert "zero 25.0 % of the pixels" in told
+    assert "image sim-01.fits, with which it is used" in told
+    told = text_of(tmp_path / "bad_mask.fits")
+    assert "mask of 512 x 512 px" in told
+    assert "zero 75.0 %" in told
+    figure = contents_of(str(tmp_path / "sim-01.weight.fits")).draw()
+    np.testing.assert_array_equal(figure.axes[0].images[0].get_array(), weight)
+
+
 def test_units_of_axes_are_in_brackets(folder):
     for name in ("run", "truth.asdf", "sim-02.ldac", "sim-reference.fits"):
         for axes in contents_of(str(folder / name)).draw().axes:

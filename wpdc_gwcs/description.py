@@ -5,6 +5,7 @@ from html import escape
 import numpy as np
 
 from wpdc_gwcs.counts import counted
+from wpdc_gwcs.detector import UNNAMED
 
 __all__ = ["as_html", "as_text", "describe"]
 
@@ -137,8 +138,9 @@ def _of_calibration(calibration):
 
 def _of_solution(solution):
     shape = solution.image_shape
-    size = "" if shape is None else f", {shape[1]} x {shape[0]} px"
-    lines = [("detector", f"{solution.detector}{size}")]
+    size = "" if shape is None else f"{shape[1]} x {shape[0]} px"
+    name = "without a name" if solution.detector == UNNAMED else solution.detector
+    lines = [("detector", ", ".join(part for part in (name, size) if part))]
     if shape is not None:
         x, y = np.meshgrid(np.linspace(0, shape[1] - 1, 21), np.linspace(0, shape[0] - 1, 21))
         u, v = solution.undistort(x.ravel(), y.ravel())

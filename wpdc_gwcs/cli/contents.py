@@ -24,6 +24,13 @@ _BY_DEFAULT = " by default"
 # Bytes of a text that are searched for cards and marks.
 _MOST_BYTES = 20_000
 _CARD = re.compile(r"(CTYPE|CRVAL|CRPIX|CUNIT|CD|PC|PV|NAXIS|CDELT|WCSAXES)[\d_]* *=")
+# Maps that belong to images, by the meaning of their pixels.
+_MAPS = {
+    "mask": "mask",
+    "weight": "weight map",
+    "error": "map of errors",
+    "variance": "map of variances",
+}
 _PAGE = re.compile(rb"\s*(<\?xml[^>]*>\s*)?<(!doctype\s+html|html)\b", re.IGNORECASE)
 
 
@@ -70,7 +77,10 @@ def contents_of(file):
     kind = file_kind(path)
     if kind == "asdf":
         return _of_asdf(file, path)
-    return _of_text(file, path) if kind == "text" else _of_fits(file)
+    if kind == "text":
+        return _of_text(file, path)
+    found = _map_in(path)
+    return _of_fits(file) if found is None else _of_map(path, *found)
 
 
 def _of_folder(path):
@@ -299,12 +309,7 @@ def _tables_of(file):
 def _of_frames(frames):
     lines = []
     for frame in frames[:_MOST_ROWS]:
-        ny, nx = frame.image_shape
-        kind = "image" if frame.load_image is not None else "list of sources"
-        epoch = "no epoch" if frame.epoch is None else f"epoch {frame.epoch:.3f}"
-        ra, dec = frame.wcs.pixel_to_world_values((nx - 1) / 2, (ny - 1) / 2)
-        lines.append((frame.name, f"{kind} of {nx} x {ny} px, detector {frame.detector}, {epoch}"))
-        lines.append(("", f"center by the header at RA {float(ra):.5f} Dec {float(dec):.5f} deg"))
+        lines += _of_frame(frame)
     if len(frames) > _MOST_ROWS:
         lines.append(("...", counted(len(frames) - _MOST_ROWS, "more frame")))
     first = frames[0]
@@ -316,3 +321,74 @@ def _of_frames(frames):
         return draw_sources(measure_sources(first), image_shape=first.image_shape)
 
     return Contents(lines, draw)
+
+
+def _of_frame(frame):
+    from wpdc_gwcs.calibration import Settings
+    from wpdc_gwcs.calibration.measure import rules_of
+    from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs
+    from wpdc_gwcs.detector import detector_label
+    from wpdc_gwcs.selection import left_out
+
+    ny, nx = frame.image_shape
+    kind = "image" if frame.load_image is not None else "list of sources"
+    epoch = "no epoch" if frame.epoch is None else f"epoch {frame.epoch:.3f}"
+    parts = (f"{kind} of {nx} x {ny} px", detector_label(frame.detector), epoch)
+    ra, dec = frame.wcs.pixel_to_world_values((nx - 1) / 2, (ny - 1) / 2)
+    scale = linear_wcs(frame.wcs, header_reference_point(frame)).scale
+    size = f"{_angle(nx * scale)} x {_angle(ny * scale)}"
+    lines = [
+        (frame.name, ", ".join(filter(None, parts))),
+        ("", f"center by the header at RA {float(ra):.5f} Dec {float(dec):.5f} deg"),
+        ("", f"{scale * 3600:.4g} arcsec / px, {size}, {frame.meta['projection']}"),
+    ]
+    if "wcs_origin" in frame.meta:
+        lines.append(("", frame.meta["wcs_origin"]))
+    if frame.load_sources is not None:
+        sources = frame.load_sources()
+        lines.append(("", left_out(rules_of(sources, frame, Settings())) + _BY_DEFAULT))
+        lines.append(("", f"columns used: {', '.join(sources.colnames)}"))
+    return lines
+
+
+def _angle(degrees):
+    """Return a length on the sky in the unit that suits it."""
+    return f"{degrees:.3g} deg" if degrees >= 1 else f"{60 * degrees:.3g} arcmin"
+
+
+def _of_map(path, role, index):
+    """Lines about a weight map or a mask: they belong to an image, and have no stars."""
+    from wpdc_gwcs.io.beside import tell_frames
+    from wpdc_gwcs.io.files import FITS_NAME, open_fits
+    from wpdc_gwcs.pictures import draw_map
+
+    with open_fits(path) as hdus:
+        pixels = np.array(hdus[index].data)
+    ny, nx = pixels.shape
+    known = pixels[np.isfinite(pixels)]
+    lines = [(path.name, f"{_MAPS[role]} of {nx} x {ny} px, by its name")]
+    if known.size:
+        lines.append(("values", f"{known.min():.4g} to {known.max():.4g}"))
+        lines.append(("zero", f"{100 * np.mean(pixels == 0):.1f} % of the pixels"))
+    near = [p for p in sorted(path.parent.iterdir()) if FITS_NAME.search(p.name)]
+    owner = next((o for o, maps in tell_frames(near) if path in maps), None)
+    text = "none beside it" if owner is None else f"{owner.name}, with which it is used"
+    lines.append(("image", text))
+    return Contents(lines, lambda: draw_map(pixels, _MAPS[role]))
+
+
+def _map_in(path):
+    """Role of a file that is a map by its name, and the number of its image; or `None`."""
+    from wpdc_gwcs.io.companions import map_role, words_of
+    from wpdc_gwcs.io.files import open_fits, stem_of
+    from wpdc_gwcs.io.images import image_shape
+
+    role = map_role(words_of(stem_of(path)))
+    if role is None:
+        return None
+    with open_fits(path) as hdus:
+        images = [
+            k for k, hdu in enumerate(hdus) if hdu.is_image and image_shape(hdu.header) is not None
+        ]
+        flat = [k for k in images if hdus[k].header["NAXIS"] == 2]
+    return (role, flat[0]) if len(images) == len(flat) == 1 else None
