@@ -4,6 +4,7 @@ import gc
 import json
 import os
 import pickle
+import re
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -26,7 +27,7 @@ from wpdc_gwcs.calibration.solving import Batch
 from wpdc_gwcs.calibration.workers import Task, Workers
 from wpdc_gwcs.cli.app import run as command
 from wpdc_gwcs.cli.inputs import expand_paths
-from wpdc_gwcs.exceptions import CatalogError, ClusterError, InputError, without_frames
+from wpdc_gwcs.exceptions import CatalogError, ClusterError, InputError, WPDCError, without_frames
 from wpdc_gwcs.frame import Frame
 from wpdc_gwcs.io import read_frames, read_table
 from wpdc_gwcs.simulation import simulate, write_simulation
@@ -309,6 +310,25 @@ def test_batches_are_solved_by_processes(inputs, pairs, tmp_path, alone, monkeyp
     monkeypatch.setattr(solving_module, "_solve", None)  # of this process
     run = calibrate(frames, reference, solution=stored, output=tmp_path, jobs=2, keep=False)
     the_same(run, tmp_path, alone)
+
+
+def test_what_is_done_is_only_looked_at(inputs, pairs, tmp_path, monkeypatch):
+    """To go on with a survey does not take the time of reading thousands of results."""
+    frames, reference, stored, _ = inputs
+    options = {"solution": stored, "output": tmp_path, "keep": False}
+    calibrate(frames, reference, **options)
+    read_again, read_frame = [], results_module._read_frame
+    monkeypatch.setattr(
+        results_module, "_read_frame", lambda *a: read_again.append(a[0].name) or read_frame(*a)
+    )
+    again = calibrate(frames, reference, resume=True, **options)
+    assert len(again.resumed) == len(frames)
+    assert not read_again
+    damaged = tmp_path / f"{frames[1].name}.wcs.asdf"
+    damaged.write_bytes(damaged.read_bytes()[: damaged.stat().st_size // 2])
+    with pytest.raises(WPDCError, match=re.escape(damaged.name)):
+        calibrate(frames, reference, resume=True, **options)
+    assert read_again == [damaged.name]
 
 
 def test_the_end_of_workers_cancels_what_they_have_not_begun():

@@ -174,8 +174,6 @@ def test_show_an_exported_file(folder, tmp_path, capsys):
     [
         (["nowhere.fits"], "nowhere.fits"),
         (["{folder}/good.wcs.asdf", "--output", "a.gif"], "must end with .png"),
-        (["{folder}/.."], "has no summary.ecsv"),
-        (["{folder}/manifest.json"], "found none\n"),  # and no hint at --wcs, which is not there
     ],
 )
 def test_what_cannot_be_shown(folder, capsys, arguments, message):

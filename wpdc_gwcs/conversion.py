@@ -11,6 +11,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.wcs.wcsapi import HighLevelWCSWrapper
 
+from wpdc_gwcs.detector import UNNAMED
 from wpdc_gwcs.exceptions import WPDCWarning
 from wpdc_gwcs.export import deviation
 from wpdc_gwcs.frozen import with_statistics
@@ -30,7 +31,7 @@ _FIT_POINTS = 64
 _TABLE_NODES = (50, 99, 197, 393)
 
 
-def fit_wcs(wcs, *, image_shape=None, detector="detector", frame="converted"):
+def fit_wcs(wcs, *, image_shape=None, detector=UNNAMED, frame="converted"):
     """Fit a polynomial and a look-up table to any celestial WCS.
 
     Parameters

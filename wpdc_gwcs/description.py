@@ -5,11 +5,15 @@ from html import escape
 import numpy as np
 
 from wpdc_gwcs.counts import counted
+from wpdc_gwcs.detector import UNNAMED
 
-__all__ = ["Described", "as_html", "describe"]
+__all__ = ["Described", "as_html", "as_text", "describe"]
 
 # Frames of a run that are named.
 _MOST_FRAMES = 50
+
+# Width of the labels, if all are this short.
+_LABEL = 11
 
 
 def describe(result):
@@ -54,9 +58,7 @@ class Described:
     """Result that shows itself in words, because its arrays would fill the screen."""
 
     def __repr__(self):
-        lines = describe(self)
-        width = max(len(label) for label, _ in lines)
-        words = [f"    {label:{width}}  {text}" for label, text in lines]
+        words = [f"    {line}" for line in as_text(describe(self))]
         return "\n".join([f"<{type(self).__name__}", *words]) + ">"
 
     def _repr_html_(self):
@@ -82,6 +84,30 @@ def as_html(result):
         for label, text in describe(result)
     )
     return f"<table><caption>{type(result).__name__}</caption>{rows}</table>"
+
+
+def as_text(lines):
+    r"""Align labels and texts in two columns.
+
+    Parameters
+    ----------
+    lines : list of (str, str)
+        Labels and texts, as from `describe`.
+
+    Returns
+    -------
+    list of str
+        One line each; the texts begin below each other, however long a label is.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.description import as_text
+    >>> print(*as_text([("frame", "solved"), ("csst-msc-01-g-1", "failed")]), sep="\n")
+    frame           solved
+    csst-msc-01-g-1 failed
+    """
+    width = max([_LABEL, *(len(label) for label, _ in lines)])
+    return [f"{label:<{width}} {text}" for label, text in lines]
 
 
 def _of_calibration(calibration):
@@ -126,8 +152,9 @@ def _of_calibration(calibration):
 
 def _of_solution(solution):
     shape = solution.image_shape
-    size = "" if shape is None else f", {shape[1]} x {shape[0]} px"
-    lines = [("detector", f"{solution.detector}{size}")]
+    size = "" if shape is None else f"{shape[1]} x {shape[0]} px"
+    name = "without a name" if solution.detector == UNNAMED else solution.detector
+    lines = [("detector", ", ".join(part for part in (name, size) if part))]
     if shape is not None:
         x, y = np.meshgrid(np.linspace(0, shape[1] - 1, 21), np.linspace(0, shape[0] - 1, 21))
         u, v = solution.undistort(x.ravel(), y.ravel())

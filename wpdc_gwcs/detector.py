@@ -1,8 +1,11 @@
-"""The area of a detector."""
+"""The area and the name of a detector."""
 
 import numpy as np
 
-__all__ = ["on_detector"]
+__all__ = ["UNNAMED", "detector_label", "on_detector"]
+
+#: Name of a detector that no header names.
+UNNAMED = "detector"
 
 
 def on_detector(x, y, image_shape, *, margin=0.0):
@@ -32,3 +35,25 @@ def on_detector(x, y, image_shape, *, margin=0.0):
     x, y = np.asarray(x, float), np.asarray(y, float)
     low, right, top = margin - 0.5, nx - 0.5 - margin, ny - 0.5 - margin
     return (x >= low) & (x <= right) & (y >= low) & (y <= top)
+
+
+def detector_label(name):
+    """Return how a detector is called in a text.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+
+    Returns
+    -------
+    str
+        For example "detector g-1"; an empty text for a detector without a name.
+
+    Examples
+    --------
+    >>> from wpdc_gwcs.detector import detector_label
+    >>> detector_label("g-1"), detector_label("detector")
+    ('detector g-1', '')
+    """
+    return "" if name == UNNAMED else f"detector {name}"

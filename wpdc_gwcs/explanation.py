@@ -26,6 +26,7 @@ from wpdc_gwcs.calibration.story import tell_match, tell_sources
 from wpdc_gwcs.catalogs import Region, catalog_source, fill_motions, read_catalog
 from wpdc_gwcs.columns import numbers_or_nan
 from wpdc_gwcs.counts import counted
+from wpdc_gwcs.detector import detector_label
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.extras import PLOT, missing
 
@@ -208,9 +209,10 @@ def _tell_frame(story):
     start = linear_wcs(frame.wcs, header_reference_point(frame))
     epoch = "no epoch" if frame.epoch is None else f"epoch {frame.epoch:.3f}"
     kind = "an image" if frame.load_image is not None else "a list of sources"
+    parts = (f"{kind} of {nx} x {ny} px", detector_label(frame.detector), epoch)
     story.tell(
         "frame",
-        f"{frame.name}: {kind} of {nx} x {ny} px, detector {frame.detector}, {epoch}",
+        f"{frame.name}: {', '.join(filter(None, parts))}",
         f"the header has its center at RA {ra:.5f} Dec {dec:.5f} deg, "
         f"{start.scale * 3600:.4g} arcsec / px",
     )

@@ -26,7 +26,7 @@ def draw_image(image):
     panel = figure.subplots()
     low, high = np.percentile(image, [20, 99.5])
     panel.imshow(image, cmap="gray_r", vmin=low, vmax=high, origin="lower")
-    panel.set(xlabel="x (px)", ylabel="y (px)")
+    panel.set(xlabel="x [px]", ylabel="y [px]")
     panel.set_title("the first exposure", loc="left", fontsize=10)
     return figure
 

@@ -1,5 +1,6 @@
 """The result folder of a run: checked names, and complete sets of files."""
 
+import itertools
 import json
 import os
 import shutil
@@ -100,6 +101,7 @@ class ResultFolder:
         self._shared = {}  # files of several frames that are there, and of how many detectors
         self._names = {}  # first frame of a group to the files that the group may write
         self._inputs = set()
+        self._loaded = {}  # results of detectors and cameras that have been read
         self._lock = None
 
     def __enter__(self):
@@ -328,8 +330,6 @@ class ResultFolder:
         InputError
             If a file is damaged, or of another run.
         """
-        from wpdc_gwcs.io import read, read_table
-
         run, states = self._manifest.run, self._manifest.frames
         outcome = Outcome(rows=[self._rows[frame.name] for frame in group])
         for row in outcome.rows:
@@ -340,27 +340,30 @@ class ResultFolder:
             path = self.folder / name
             if name.endswith(".wcs.asdf"):
                 stem = name.removesuffix(".wcs.asdf")
-                found = read(path)
                 tables = {
-                    kind: read_table(self.folder / f"{stem}.{kind}.ecsv")
+                    kind: self.folder / f"{stem}.{kind}.ecsv"
                     for kind in ("sources", "matches")
                     if f"{stem}.{kind}.ecsv" in states[stem]["files"]
                 }
-                runs = [found.provenance.get("run"), *(t.meta.get("run") for t in tables.values())]
-                if any(one != run for one in runs):
-                    raise InputError(
-                        f"{path}: must come from the same run as its tables ({run}), does not"
-                    )
-                if keep:
-                    outcome.calibrations.append(replace(found, **tables))
+                if keep or not all(_looks_complete(p, run) for p in (path, *tables.values())):
+                    calibration = _read_frame(path, tables, run)
+                    outcome.calibrations.extend([calibration] if keep else [])
             elif name.endswith(".solution.asdf"):
-                found = read(path)
+                found = self._read_shared(name)
                 current = name == f"{file_stem(found.detector)}.solution.asdf"
                 kind = outcome.solutions if current else outcome.superseded
                 kind[found.detector] = found
             elif name.endswith(".camera.asdf"):
-                outcome.cameras.append(read(path))
+                outcome.cameras.append(self._read_shared(name))
         return outcome
+
+    def _read_shared(self, name):
+        """Read a file of a detector or a camera, which the frames of many groups share."""
+        from wpdc_gwcs.io import read
+
+        if name not in self._loaded:
+            self._loaded[name] = read(self.folder / name)
+        return self._loaded[name]
 
     def write(self, group, outcome, workers):
         """Write the outcome of some frames completely or not at all.
@@ -502,6 +505,29 @@ def with_files(outcome, run):
             for path in paths:
                 path.unlink()
     return replace(outcome, calibrations=[], files=files)
+
+
+def _looks_complete(path, run):
+    """Whether a file is of a run and has its end, without the time that reading it takes."""
+    data = path.read_bytes()
+    if path.suffix == ".asdf":
+        text, _, blocks = data.partition(b"\n...\n")
+        return f"run: {run}".encode() in text and b"#ASDF BLOCK INDEX" in blocks
+    # The metadata of a table are comments before its rows.
+    comments = itertools.takewhile(lambda line: line.startswith(b"#"), data.splitlines())
+    return any(f"run: {run}".encode() in line for line in comments) and data.endswith(b"\n")
+
+
+def _read_frame(path, tables, run):
+    """Read the WCS and the tables of a frame; raise an error if one is of another run."""
+    from wpdc_gwcs.io import read, read_table
+
+    found = read(path)
+    tables = {kind: read_table(table) for kind, table in tables.items()}
+    runs = [found.provenance.get("run"), *(table.meta.get("run") for table in tables.values())]
+    if any(one != run for one in runs):
+        raise InputError(f"{path}: must come from the same run as its tables ({run}), does not")
+    return replace(found, **tables)
 
 
 @one_blas_thread

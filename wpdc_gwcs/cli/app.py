@@ -113,7 +113,7 @@ def set_verbosity(verbose, quiet):
 
 def _fail(message, status, args=None):
     text = " ".join(str(message).split())
-    hint = hint_of(text)
+    hint = hint_of(text, _called(args)[1])
     if hint and hint.startswith("--") and hint.split()[0].strip(",") not in _options_of(args):
         # It is for another command that reads the same kind of file.
         hint = None
@@ -121,14 +121,20 @@ def _fail(message, status, args=None):
     return status
 
 
-def _options_of(args):
-    """Options of the command that was called, by their names."""
-    command = typer.main.get_command(app)
+def _called(args):
+    """Return the command that was called, and its words, such as "catalog info"."""
+    command, words = typer.main.get_command(app), []
     for word in sys.argv[1:] if args is None else args:
         if word not in getattr(command, "commands", ()):
             break
         command = command.commands[word]
-    return {name for parameter in command.params for name in parameter.opts}
+        words.append(word)
+    return command, " ".join(words)
+
+
+def _options_of(args):
+    """Options of the command that was called, by their names."""
+    return {name for parameter in _called(args)[0].params for name in parameter.opts}
 
 
 def run(args=None):

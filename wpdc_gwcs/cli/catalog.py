@@ -21,6 +21,7 @@ from wpdc_gwcs.cli.options import (
     require_free,
 )
 from wpdc_gwcs.cli.positions import read_position
+from wpdc_gwcs.description import as_text
 from wpdc_gwcs.exceptions import InputError
 from wpdc_gwcs.extras import require
 
@@ -172,12 +173,14 @@ def info_command(
     stars = stars[inside(stars)]
     if len(stars) == 0:
         raise InputError(f"{catalog}: has no stars in this part of the sky")
-    for label, text in lines_about(stars):
-        typer.echo(f"{label:<12}{text}")
-    typer.echo("\n   mag      stars  per sq. deg  with motion  error mas")
+    for line in as_text(list(lines_about(stars))):
+        typer.echo(line)
     from wpdc_gwcs.catalogs.overview import count_by_magnitude
 
-    for row in count_by_magnitude(stars):
+    rows = count_by_magnitude(stars)
+    if len(rows):
+        typer.echo("\n   mag      stars  per sq. deg  with motion  error mas")
+    for row in rows:
         typer.echo(
             f"{row['mag_from'].value:3.0f}-{row['mag_to'].value:<3.0f} {row['n']:9d}  "
             f"{row['density'].value:11.1f}  {100 * row['with_motion']:9.1f} %  "

@@ -85,6 +85,7 @@ _OF_COMMANDS = (
         r"(?P<path>.+?): must have a 'wpdc' tree|(?P<other>.+?): --solution needs",
         "wpdc show {path}, which says what it is",
     ),
+    (r"(?P<path>.+?): .*\bthe manifest of a run", "wpdc show {folder}"),
     (
         r".*not a manifest of a run|.*must come from the same run as its tables",
         "--overwrite to start over, or another --output",
@@ -130,13 +131,16 @@ _OF_FRAMES = (
 )  # fmt: skip
 
 
-def hint_of(message):
+def hint_of(message, command=""):
     """Return a hint for an error that ends a command.
 
     Parameters
     ----------
     message : str
         Message of the error.
+    command : str, optional
+        Command that failed, such as ``show`` or ``catalog info``; it is not suggested for the same
+        file again.
 
     Returns
     -------
@@ -150,7 +154,10 @@ def hint_of(message):
             path = parts.get("path") or parts.get("other") or ""
             if hint == "_similar":
                 return _similar(path)
-            return hint.format(path=shlex.quote(path))
+            folder = shlex.quote(str(Path(path).parent))
+            hint = hint.format(path=shlex.quote(path), folder=folder)
+            again = f"wpdc {command} {shlex.quote(path)}" if command and path else None
+            return None if again and f"{hint},".startswith(f"{again},") else hint
     return None
 
 

@@ -34,7 +34,13 @@ from wpdc_gwcs.io.files import (
     split_extension,
 )
 from wpdc_gwcs.io.fits import warn_if_far
-from wpdc_gwcs.io.headers import extension_names, find_extension, header_shape, header_value
+from wpdc_gwcs.io.headers import (
+    WRITTEN_BY_US,
+    extension_names,
+    find_extension,
+    header_shape,
+    header_value,
+)
 from wpdc_gwcs.io.stale import alternates_of, is_stale, tables_of
 
 __all__ = ["INTO_FORMS", "image_numbers", "write_into"]
@@ -385,7 +391,7 @@ def _data_sum(source, part):
 
 def _history(made):
     worst = made.keywords_deviation if made.form == "fits" else made.deviation
-    text = f"WCS by wpdc_gwcs {__version__.split('+')[0]} as {made.form}"
+    text = f"{WRITTEN_BY_US} {__version__.split('+')[0]} as {made.form}"
     return f"{text}, good to {worst:.2g} px"[:72]
 
 

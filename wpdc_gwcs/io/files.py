@@ -17,6 +17,7 @@ from wpdc_gwcs.catalogs import READ_ERRORS, special_file, split_extension
 from wpdc_gwcs.exceptions import FileFormatError, InputError
 
 __all__ = [
+    "FITS_NAME",
     "READ_ERRORS",
     "OutputExistsError",
     "as_utf8",
@@ -57,9 +58,13 @@ _FOREIGN = (
 )
 # Tables that can be read: HDF5, Parquet, text in UTF-16.
 _TABLES = (b"\x89HDF", b"PAR1", b"\xff\xfe", b"\xfe\xff")
+# Text that is no table: JSON, and the manifest of a run, whose first entry is its name.
+_MANIFEST = re.compile(rb'\s*\{\s*"run"\s*:')
+_JSON = re.compile(rb'\s*(\{\s*["}]|\[\s*["{\[])')
 # No other text begins with control characters other than blanks; headers may be padded with zeros.
 _CONTROL = re.compile(rb".{0,7}\0|.*[\x01-\x08\x0e-\x1f\x7f]", re.DOTALL)
-_FITS_NAME = re.compile(r"\.(fits?|fts|fz)(\.(gz|bz2|xz))?$", re.IGNORECASE)
+#: Names of FITS files.
+FITS_NAME = re.compile(r"\.(fits?|fts|fz)(\.(gz|bz2|xz))?$", re.IGNORECASE)
 _HEADER_NAME = re.compile(r"\.(a?head|hdr|txt)$", re.IGNORECASE)
 _STEM_SUFFIXES = re.compile(
     r"\.(fz|gz|bz2|xz|fits?|fts|cat|ldac|ecsv|csv|txt|dat|tbl|head|asdf)$", re.IGNORECASE
@@ -201,7 +206,7 @@ def file_kind(path, *, error=FileFormatError):
     if kind == "fits" and (start[80:] in (b"\n", b"\r") or _HEADER_NAME.search(path.name)):
         # A header alone as text: cards in lines, or without line ends if the name says so.
         kind = "text"
-    if kind != "fits" and _FITS_NAME.search(path.name):
+    if kind != "fits" and FITS_NAME.search(path.name):
         shown = start[:9].decode("latin-1")
         raise error(f"{path}: a FITS file must begin with 'SIMPLE  =', got {shown!r}")
     return kind
@@ -212,6 +217,8 @@ def _foreign(start):
     if start.startswith(_TABLES):
         return None
     known = next((what for magic, what in _FOREIGN if start.startswith(magic)), None)
+    if known is None and _JSON.match(start):
+        known = "a JSON file, the manifest of a run" if _MANIFEST.match(start) else "a JSON file"
     return known or ("another binary file" if _CONTROL.match(start) else None)
 
 

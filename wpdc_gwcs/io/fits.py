@@ -7,6 +7,7 @@ import numpy as np
 from astropy.io import fits
 
 from wpdc_gwcs.columns import listed
+from wpdc_gwcs.detector import UNNAMED
 from wpdc_gwcs.exceptions import FileFormatError, WPDCWarning
 from wpdc_gwcs.export import (
     INSTRUMENT_NAME,
@@ -206,9 +207,7 @@ def read_fits(path):
     frame = header_text(header, "FRAME") or stem_of(path)
     try:
         solution = DistortionSolution(
-            detector=header_text(header, "DETECTOR")
-            or header_text(header, "EXTNAME")
-            or "detector",
+            detector=header_text(header, "DETECTOR") or header_text(header, "EXTNAME") or UNNAMED,
             image_shape=tan.image_shape,
             lookup_table=table,
             **instrument,

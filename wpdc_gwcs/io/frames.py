@@ -44,6 +44,7 @@ from wpdc_gwcs.io.headers import (
     find_extension,
     header_shape,
     header_text,
+    history_of_wcs,
     read_headers,
 )
 from wpdc_gwcs.io.identity import (
@@ -382,9 +383,17 @@ def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
         "headers": headers,
         "shape": shape,
         "wcs": parsed,
+        "facts": _facts_of_wcs(wcs_header),
         "origin": origin,
         "warnings": [w.message for w in seen if issubclass(w.category, WPDCWarning)],
     }
+
+
+def _facts_of_wcs(header):
+    """Projection of a WCS, and its origin if this package wrote it."""
+    facts = {"projection": ", ".join(header_text(header, f"CTYPE{axis}") for axis in (1, 2))}
+    history = history_of_wcs(header)
+    return facts | {"wcs_origin": history} if history else facts
 
 
 def _ldac_header(hdus, index, where):
@@ -425,7 +434,7 @@ def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):
         read_noise=image_read_noise(headers),
         saturation=image_saturation(headers),
         **exposure_keys(headers, exposure_keyword, where, part["chosen"]),
-        meta=header_facts(headers) | _choices(part, str(path)),
+        meta=header_facts(headers) | part["facts"] | _choices(part, str(path)),
         inputs=tuple(dict.fromkeys(c.path for c in part["companions"] if c.path != str(path))),
         **loaders,
     )
@@ -501,7 +510,7 @@ def _read_text_table(
         source=str(path),
         load_sources=sources.copy,
         **exposure_keys([meta, header], exposure_keyword, str(path)),
-        meta=header_facts([meta, header]) | _first_pixel(origin),
+        meta=header_facts([meta, header]) | _facts_of_wcs(header) | _first_pixel(origin),
     )
 
 

@@ -10,6 +10,7 @@ from wpdc_gwcs.exceptions import FileFormatError
 from wpdc_gwcs.io.files import file_kind, open_fits, split_extension
 
 __all__ = [
+    "WRITTEN_BY_US",
     "clean_header",
     "extension_names",
     "find_extension",
@@ -17,11 +18,14 @@ __all__ = [
     "header_shape",
     "header_text",
     "header_value",
+    "history_of_wcs",
     "is_ours",
     "positive_number",
     "read_headers",
 ]
 
+#: Beginning of the HISTORY card of a WCS that this package wrote.
+WRITTEN_BY_US = "WCS by wpdc_gwcs"
 _CARD_START = re.compile(r"[A-Z0-9_-]{1,8} *= *\S")
 
 
@@ -308,3 +312,23 @@ def header_shape(header):
         if len(sizes) == 2:
             return int(ny), int(nx)
     return None
+
+
+def history_of_wcs(header):
+    """Return what a header says about the origin of its WCS.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        The header.
+
+    Returns
+    -------
+    text : str
+        The last HISTORY card by which this package marks a WCS that it wrote; empty if there is
+        none.
+    """
+    if "HISTORY" not in header:
+        return ""
+    told = [str(line) for line in header["HISTORY"] if str(line).startswith(WRITTEN_BY_US)]
+    return told[-1].strip() if told else ""

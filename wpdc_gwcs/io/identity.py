@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 
+from wpdc_gwcs.detector import UNNAMED
 from wpdc_gwcs.io.dates import EXPOSURE_KEYS, header_start
 from wpdc_gwcs.io.exposures import camera_key, exposure_key, has_identifier
 from wpdc_gwcs.io.headers import header_text, positive_number
@@ -120,7 +121,7 @@ def detector_name(headers):
     Returns
     -------
     str
-        Name of the detector, or "detector".
+        Name of the detector, or `wpdc_gwcs.detector.UNNAMED`.
     """
     # The primary header describes the whole camera; the header of the frame takes precedence.
     for header in headers:
@@ -128,7 +129,7 @@ def detector_name(headers):
             text = header_text(header, key)
             if text.upper() not in (*NOT_NAMES, "LDAC_OBJECTS", "LDAC_IMHEAD"):
                 return text
-    return "detector"
+    return UNNAMED
 
 
 def header_facts(headers):

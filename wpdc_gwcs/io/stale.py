@@ -5,7 +5,7 @@ import re
 from astropy.io import fits
 
 from wpdc_gwcs.export import INSTRUMENT_NAME, TABLE_NAME
-from wpdc_gwcs.io.headers import header_text, header_value, is_ours
+from wpdc_gwcs.io.headers import WRITTEN_BY_US, header_text, header_value, is_ours
 
 __all__ = ["alternates_of", "is_stale", "tables_of"]
 
@@ -29,7 +29,6 @@ _PRIMARY = re.compile(
     # Keywords of this package.
     r"WPDC(?:VERS|TAB|DEV)"
 )
-_HISTORY = "WCS by wpdc_gwcs"
 
 
 def is_stale(card, alternates):
@@ -49,7 +48,7 @@ def is_stale(card, alternates):
     """
     keyword = card[:8].rstrip()
     if keyword == "HISTORY":
-        return card[8:].startswith(_HISTORY)
+        return card[8:].startswith(WRITTEN_BY_US)
     if card[8:9] != "=":
         return False
     if _PRIMARY.fullmatch(keyword):

@@ -9,6 +9,10 @@ __all__ = ["plot_focal_plane"]
 
 # Default length of the longest arrow, as a fraction of the distance between arrows.
 _LONGEST = 2.5
+# Height of the key above the axes, beside the title.
+_KEY_INCHES = 0.12
+# Points along each side of a detector where its greatest distortion is looked for, edges included.
+_N_POINTS = 21
 
 
 def plot_focal_plane(detectors, *, axes=None, n_arrows=8, magnification=None):
@@ -90,15 +94,20 @@ def plot_focal_plane(detectors, *, axes=None, n_arrows=8, magnification=None):
         *start / 1e3, *step / 1e3, angles="xy", scale_units="xy", scale=1 / magnification,
         width=0.0022, color=ORANGE, zorder=3,
     )  # fmt: skip
+    # Arrows at the edges may lead out of the outlines.
+    axes.update_datalim((start + magnification * step).T / 1e3)
+    axes.autoscale_view()
     key = round_number(longest / 2) if longest > 0 else 1.0
+    above = _KEY_INCHES * axes.figure.dpi / axes.bbox.height
     axes.quiverkey(
-        quiver, 0.86, 1.04, key / 1e3, f"{key:g} px", labelpos="E", color=ORANGE,
+        quiver, 0.86, 1 + above, key / 1e3, f"{key:g} px", labelpos="E", color=ORANGE,
         coordinates="axes",
     )  # fmt: skip
     axes.set_aspect("equal")
     axes.set_xlabel("focal plane x [1000 px]")
     axes.set_ylabel("focal plane y [1000 px]")
-    axes.set_title(rf"distortion $\times$ {magnification:g}, at most {longest:.3g} px", loc="left")
+    most = max(_greatest(solution) for _, solution, _ in places)
+    axes.set_title(rf"distortion $\times$ {magnification:g}, at most {most:.3g} px", loc="left")
     return axes
 
 
@@ -106,6 +115,17 @@ def _outline(image_shape):
     """Outline of a detector along the outer edges of its pixels, closed."""
     ny, nx = image_shape
     return np.array([[0, nx, nx, 0, 0], [0, 0, ny, ny, 0]]) - 0.5
+
+
+def _greatest(solution):
+    """Return the greatest distortion of a detector, px."""
+    ny, nx = solution.image_shape
+    x, y = (
+        a.ravel()
+        for a in np.meshgrid(np.linspace(0, nx - 1, _N_POINTS), np.linspace(0, ny - 1, _N_POINTS))
+    )
+    u, v = solution.undistort(x, y)
+    return float(np.nanmax(np.hypot(u - x, v - y)))
 
 
 def _of_camera(camera):
