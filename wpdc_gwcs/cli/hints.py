@@ -99,6 +99,10 @@ _OF_COMMANDS = (
         "dask worker {path}, on machines that see the files",
     ),
     (r"--scheduler .*: no Dask scheduler", "dask scheduler, which prints its address"),
+    (
+        r".*: not the same (?:exposure|detector)",
+        "--any-exposure if the header of the image is wrong, or the WCS file of this image",
+    ),
     (r".*would both write", "different names, or one run for each of them"),
     (r"exposure .*left out|all \d+ exposures were left out", "wpdc explain FRAME --catalog CAT"),
 )

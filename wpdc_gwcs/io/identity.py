@@ -9,7 +9,9 @@ from wpdc_gwcs.io.headers import header_text, positive_number
 
 __all__ = [
     "NOT_NAMES",
+    "NO_DETECTOR",
     "detector_name",
+    "detector_names",
     "distinct",
     "exposure_keys",
     "file_name",
@@ -35,6 +37,8 @@ _FACTS = {"filter": ("FILTER", "FILTER1", "BAND"), "object": ("OBJECT",), "date"
 _CAMERA = "camera"
 #: Generic names of extensions.
 NOT_NAMES = ("PRIMARY", "COMPRESSED_IMAGE", "")
+#: Name of a detector that the header does not name.
+NO_DETECTOR = "detector"
 
 
 def exposure_keys(headers, exposure_keyword, where, chosen=()):
@@ -122,13 +126,30 @@ def detector_name(headers):
     str
         Name of the detector, or "detector".
     """
+    return next(iter(detector_names(headers).values()), NO_DETECTOR)
+
+
+def detector_names(headers):
+    """List all names that headers have for a detector.
+
+    Parameters
+    ----------
+    headers : list of `~astropy.io.fits.Header`
+        Header of the frame first, then that of its file.
+
+    Returns
+    -------
+    dict
+        Name by keyword, best first.  The name of an extension, ``EXTNAME``, may be of anything.
+    """
     # The primary header describes the whole camera; the header of the frame takes precedence.
+    found = {}
     for header in headers:
         for key in _DETECTOR_KEYS:
             text = header_text(header, key)
             if text.upper() not in (*NOT_NAMES, "LDAC_OBJECTS", "LDAC_IMHEAD"):
-                return text
-    return "detector"
+                found.setdefault(key, text)
+    return found
 
 
 def header_facts(headers):
