@@ -112,7 +112,7 @@ def export_command(
         raise InputError(f"--alternates must be keep or remove, got {alternates!r}")
     if into is not None:
         if output is not None:
-            require_free(output, overwrite)
+            require_free(output, overwrite, format=format)
         lines = _into(files, into, format, degree, output, alternates, any_exposure, overwrite)
     else:
         lines = _one_by_one(files, output, format, degree, overwrite)
@@ -126,7 +126,7 @@ def _one_by_one(files, output, format, degree, overwrite):
     found = wcs_files(files)
     places = _places(found, output, format, in_folder=found != files or len(files) > 1)
     for place in places.values():
-        require_free(place, overwrite)
+        require_free(place, overwrite, format=format)
     for file, place in places.items():
         calibration = read_one(file)
         with _as_input_error():
@@ -313,7 +313,7 @@ def convert_command(
         raise InputError(f"--to must be one of {', '.join(formats)}, got {to!r}")
     if size is not None and min(size) < 2:
         raise InputError(f"--size must be two numbers of 2 or more, got {size[0]} {size[1]}")
-    require_free(output, overwrite)
+    require_free(output, overwrite, format=to)
     found = read_any(file, image_shape=None if size is None else size[::-1])
     if isinstance(found, Camera):
         raise InputError(

@@ -99,7 +99,7 @@ def monitor_command(
         raise InputError(f"--false-alarm must be between 0 and 1, got {false_alarm:g}")
     cells_file = None
     if output is not None:
-        require_free(output, overwrite)
+        require_free(output, overwrite, format="ecsv")
         if every is not None:
             cells_file = output.with_suffix(f".cells{output.suffix}")
             require_free(cells_file, overwrite)
