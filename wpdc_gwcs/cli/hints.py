@@ -46,8 +46,8 @@ _OF_COMMANDS = (
         "the output folder of wpdc calibrate",
     ),
     (
-        r".*monitor needs a \*\.solution\.asdf",
-        "the --solution of the frames",
+        r"[^;]*needs a \*\.solution\.asdf or \*\.camera\.asdf file[^;]*$",
+        "the file of this name that wpdc calibrate has written",
     ),
     (
         r"(?P<path>.+?): (?:catalog must be an existing file|must be a readable file: No such file"
@@ -82,7 +82,7 @@ _OF_COMMANDS = (
         "wpdc show {path}, which says what it is",
     ),
     (
-        r"(?P<path>.+?): must have a 'wpdc' tree|(?P<other>.+?): --solution needs",
+        r"(?P<path>.+?): must have a 'wpdc' tree",
         "wpdc show {path}, which says what it is",
     ),
     (
@@ -149,7 +149,7 @@ def hint_of(message):
         found = re.match(pattern, message, re.DOTALL)
         if found:
             parts = found.groupdict()
-            path = parts.get("path") or parts.get("other") or ""
+            path = parts.get("path") or ""
             if hint == "_similar":
                 return _similar(path)
             return hint.format(path=shlex.quote(path))

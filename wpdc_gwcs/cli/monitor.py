@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
-from wpdc_gwcs.cli.files import match_files, read_with_wcs, wcs_beside
+from wpdc_gwcs.cli.files import match_files, read_stored, read_with_wcs, wcs_beside
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free, require_plotting
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.exceptions import FitError, InputError
@@ -187,16 +187,12 @@ class _MonitoredFrame:
 
 
 def _solutions(path):
-    from wpdc_gwcs.camera import Camera
-    from wpdc_gwcs.io import read
     from wpdc_gwcs.solution import DistortionSolution
 
-    stored = read(path)
+    stored = read_stored(path, "monitor")
     if isinstance(stored, DistortionSolution):
         return {stored.detector: stored}
-    if isinstance(stored, Camera):
-        return dict(stored.solutions)
-    raise InputError(f"{path}: monitor needs a *.solution.asdf file or a *.camera.asdf file")
+    return dict(stored.solutions)
 
 
 def _frames(paths, *, need_epochs):
