@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.app import Interrupted, app
 from wpdc_gwcs.cli.completion import complete, one_of
 from wpdc_gwcs.cli.files import read_stored
 from wpdc_gwcs.cli.hints import hint_of_frame
@@ -335,24 +335,30 @@ def calibrate_command(
     if stars is catalog:
         require_catalog_file(catalog)
     cluster = nullcontext() if scheduler is None else cluster_executor(scheduler, scheduler_timeout)
-    with cluster as pool, progress_bar(quiet=quiet) as progress:
-        loaded = read_files(paths, progress=progress, wcs=wcs, detector=detector, **keys)
-        run = calibrate(
-            loaded,
-            stars,
-            solution=stored,
-            update=update,
-            settings=settings,
-            jobs=jobs,
-            executor=pool,
-            output=output,
-            overwrite=overwrite,
-            resume=resume,
-            keep=False,
-            progress=progress,
-        )
-    if report:
-        write_page(output, page, overwrite=overwrite or resume)
+    run = None
+    try:
+        with cluster as pool, progress_bar(quiet=quiet) as progress:
+            loaded = read_files(paths, progress=progress, wcs=wcs, detector=detector, **keys)
+            run = calibrate(
+                loaded,
+                stars,
+                solution=stored,
+                update=update,
+                settings=settings,
+                jobs=jobs,
+                executor=pool,
+                output=output,
+                overwrite=overwrite,
+                resume=resume,
+                keep=False,
+                progress=progress,
+            )
+        if report:
+            write_page(output, page, overwrite=overwrite or resume)
+    except KeyboardInterrupt as stop:
+        if run is None and not getattr(stop, "has_results", False):
+            raise
+        raise Interrupted from stop
     if not quiet:
         if resume:
             typer.echo(
