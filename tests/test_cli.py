@@ -394,6 +394,17 @@ def test_sky2pix_refuses_tables_in_one_line(results, tmp_path, capsys, rows, mes
         (["sky2pix", "{file}", "12:34:56"], 2, "12:34:56: no such file; give ra and dec, or one"),
         (["sky2pix", "{file}", "12:34:56", "1:2:3"], 1, "outside the sky of the detector"),
         (["pix2sky", "{file}", "-100", "5"], 1, "outside the detector"),
+        (
+            ["export", "{file}", "--format", "tpv", "--output", "o.asdf"],
+            2,
+            "o.asdf: the name of a file in the format tpv must end with .fits, ends with .asdf",
+        ),
+        (["export", "{file}", "--format", "stock", "--output", "o.fits"], 2, "end with .asdf, "),
+        (["export", "{file}", "--format", "head", "--output", "o.ecsv"], 2, "end with .head, "),
+        (["convert", "{file}", "--to", "tpv", "--output", "im.head"], 2, "end with .fits, "),
+        (["convert", "{file}", "--to", "asdf", "--output", "im.fits"], 2, "end with .asdf, "),
+        (["export", "{file}", "--into", "a.fits", "--output", "b.head"], 2, "end with .fits, "),
+        (["detect", "missing.fits", "--output", "o.fits"], 2, "end with .ecsv, ends with .fits"),
         (["sky2pix", "{file}", "300.0", "-60.0"], 1, "outside the sky of the detector"),
         (["pix2sky", "{file}", "1", "2", "3"], 2, "got 3 values"),
         (["pix2sky", "{file}", "1024"], 2, "give x and y, or one table; got 1 value: 1024"),
@@ -585,7 +596,33 @@ def test_monitor_tells_a_changed_table(results, tmp_path, capsys):
     assert abs(int(area) - 25) < 8
     assert Table.read(cells)["changed"][0]
     assert run(["monitor", str(results / "sim-01.wcs.asdf"), str(tmp_path)]) == 2
-    assert "needs a *.solution.asdf file" in error_of(capsys)
+    assert "needs a *.solution.asdf or *.camera.asdf file" in error_of(capsys)
+
+
+def test_a_suffix_that_belongs_to_no_format_is_accepted(results, tmp_path, capsys):
+    for format, name in (("tpv", "a.hdr"), ("head", "a.txt"), ("stock", "a"), ("sip", "a.FIT")):
+        command = ["export", str(results / "sim-01.wcs.asdf"), "--format", format]
+        assert run([*command, "--output", str(tmp_path / name)]) == 0
+        assert (tmp_path / name).exists()
+
+
+def test_sky_outside_names_the_center_and_hours(results, simulation, capsys):
+    file = str(results / "sim-01.wcs.asdf")
+    ny, nx = simulation.exposures[0].frame().image_shape
+    center = read(file).wcs((nx - 1) / 2, (ny - 1) / 2)
+    assert run(["sky2pix", file, f"{center[0] / 15:.7f}", f"{center[1]:.7f}"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == "nan nan\n"
+    found = re.search(r"center is RA (\S+) Dec (\S+) deg; if (\S+) is in hours, RA is (\S+) deg",
+                      captured.err)  # fmt: skip
+    np.testing.assert_allclose([float(found[1]), float(found[2])], center, atol=1e-5)
+    assert float(found[4]) == pytest.approx(center[0], abs=1e-4)
+    # Sexagesimal positions are in hours anyway, and other numbers are elsewhere in hours too.
+    for wrong in (("1:2:3", "1:2:3"), ("300.0", "-60.0"), (str(center[0] + 5), str(center[1]))):
+        assert run(["sky2pix", file, *wrong]) == 1
+        line = error_of(capsys)
+        assert "whose center is RA" in line
+        assert "hours" not in line
 
 
 def test_match_alone(inputs, tmp_path, capsys):

@@ -130,10 +130,16 @@ def test_what_is_no_solution_is_refused(inputs, updated, tmp_path, capsys):
     assert "--solution needs a *.solution.asdf or *.camera.asdf file" in lines[0]
     assert run([*command, "--solution", str(updated)]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
-    hint = f"is a folder; try --solution {updated / 'sim.solution.asdf'}"
+    hint = f"is a folder; try: --solution {updated / 'sim.solution.asdf'}"
     assert line.endswith(hint)
     assert run([*command, "--solution", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.strip().endswith("--solution must be a file, is a folder")
+    assert "file, is a folder; try: the file of this name" in capsys.readouterr().err
+    # Nor is a table, whose folder has a solution.
+    assert run([*command, "--solution", str(updated / "summary.ecsv")]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "--solution needs a *.solution.asdf or *.camera.asdf file; try: --solution " in line
+    assert line.endswith(f"{updated / 'sim.solution.asdf'}")
+    assert "--wcs" not in line
 
 
 @pytest.fixture(scope="module")

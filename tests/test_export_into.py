@@ -6,7 +6,9 @@ import warnings
 
 import numpy as np
 import pytest
+from astropy import units as u
 from astropy.io import fits
+from astropy.time import Time
 from astropy.wcs import WCS
 from test_io_formats import distance, grid, make_calibration
 
@@ -239,3 +241,106 @@ def test_a_solution_goes_by_its_detector(tmp_path, exposures):
     solutions = {name: one.solution for name, one in exposures["a"].items()}
     found = assign_extensions(image, frames_of_image(image), solutions)
     assert found == {1: "N1", 3: "N2", 4: "S1", 5: "S2"}
+
+
+def write_one(path, one, **cards):
+    """Write an image of one detector that has the shape of a calibration."""
+    header = header_of(one)
+    header.update({key.replace("_", "-"): value for key, value in cards.items()})
+    fits.writeto(path, np.zeros(one.solution.image_shape, np.int16), header)
+
+
+@pytest.fixture
+def dated(tmp_path, exposures):
+    """Calibration of a 600 s exposure from `DATE` on, and its file."""
+    middle = Time(DATE, scale="utc") + 300 * u.s
+    epoch = middle.tt.jyear
+    one = dataclasses.replace(exposures["a"]["N1"], provenance={"epochs": (epoch, epoch)})
+    file = tmp_path / "results.wcs.asdf"
+    write(one, file)
+    return one, file
+
+
+@pytest.mark.parametrize(
+    "cards",
+    [
+        {"DATE_OBS": DATE, "EXPTIME": 600.0},
+        {"MJD_OBS": Time(DATE, scale="utc").mjd, "EXPTIME": 600.0, "DETECTOR": "N1"},
+        # The start of the exposure in place of its middle, as some programs write it.
+        {"DATE_AVG": DATE, "EXPTIME": 600.0},
+        {"DATE_BEG": DATE, "DATE_END": "2016-05-01T03:10:00", "DATE": "2026-01-01"},
+        {"DATE": "2026-01-01"},
+        {"OBJECT": "no date"},
+        {"DATE_OBS": DATE, "EXPTIME": 600.0, "EXTNAME": "SCI"},
+    ],
+)
+def test_a_processed_copy_is_accepted(tmp_path, dated, capsys, cards):
+    one, file = dated
+    write_one(tmp_path / "copy.fits", one, **cards)
+    out = run_well(capsys, "export", file, "--into", tmp_path / "copy.fits").out
+    assert "copy.fits: written as tpv" in out
+
+
+@pytest.mark.parametrize(
+    ("cards", "message"),
+    [
+        # The next exposure begins ten seconds after the end of this one.
+        ({"DATE_OBS": "2016-05-01T03:10:10", "EXPTIME": 600.0}, "not the same exposure"),
+        ({"DATE_OBS": "2016-05-02T03:00:00", "EXPTIME": 600.0}, "not the same exposure"),
+        ({"DATE_OBS": DATE, "EXPTIME": 600.0, "DETECTOR": "N2"}, "is of detector N2, "),
+        ({"DETECTOR": "N2"}, "of N1: not the same detector"),
+    ],
+)
+@pytest.mark.parametrize("extension", ["", "[0]"])
+def test_one_file_of_another_exposure_is_refused(
+    tmp_path, dated, capsys, cards, message, extension
+):
+    one, file = dated
+    image = tmp_path / "other.fits"
+    write_one(image, one, **cards)
+    before = image.read_bytes()
+    line = refusal(capsys, "export", file, "--into", f"{image}{extension}")
+    assert message in line
+    assert f"{image}{extension}: is of " in line
+    assert str(file) in line
+    assert "; try: --any-exposure" in line
+    assert image.read_bytes() == before
+    run_well(capsys, "export", file, "--into", f"{image}{extension}", "--any-exposure")
+    assert fits.getheader(image)["CTYPE1"] == "RA---TPV"
+
+
+def test_an_image_of_the_same_name_may_be_of_another_night(tmp_path, dated, capsys):
+    one, file = dated
+    image = tmp_path / f"{one.frame}.fits"
+    write_one(image, one, DATE_OBS="2016-05-02T03:00:00", EXPTIME=600.0)
+    assert "not the same exposure" in refusal(capsys, "export", file, "--into", image)
+    image.unlink()
+    # But a detector may have been named by hand.
+    write_one(image, one, DATE_OBS=DATE, EXPTIME=600.0, DETECTOR="E2V")
+    run_well(capsys, "export", file, "--into", image)
+
+
+def test_one_file_is_not_written_into_another_detector(folder, capsys):
+    """Of a mosaic whose extensions have the names of their detectors."""
+    file, image = folder / "results" / "a_S1.wcs.asdf", folder / "a.fits"
+    before = image.read_bytes()
+    line = refusal(capsys, "export", file, "--into", f"{image}[N1]")
+    assert f"{image}[N1]: is of detector N1, {file} of S1: not the same detector" in line
+    assert image.read_bytes() == before
+    run_well(capsys, "export", file, "--into", f"{image}[S1]")
+
+
+def test_another_shape_is_refused_for_any_exposure(tmp_path, dated, capsys):
+    one, file = dated
+    fits.writeto(tmp_path / "small.fits", np.zeros((10, 20)), header_of(one))
+    line = refusal(capsys, "export", file, "--into", tmp_path / "small.fits", "--any-exposure")
+    assert "must have the shape of the detector" in line
+
+
+def test_a_mosaic_of_the_same_names_may_be_of_another_night(folder, exposures, capsys):
+    for one in exposures["a"].values():
+        late = dataclasses.replace(one, provenance={"epochs": (2017.0, 2017.0)})
+        write(late, folder / "results" / f"{one.frame}.wcs.asdf", overwrite=True)
+    line = refusal(capsys, "export", folder / "results", "--into", folder / "a.fits")
+    assert "not the same exposure; try: --any-exposure" in line
+    run_well(capsys, "export", folder / "results", "--into", folder / "a.fits", "--any-exposure")

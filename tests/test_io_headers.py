@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
+from astropy.table import Table
 from astropy.time import Time
 from astropy.wcs import WCS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wpdc_gwcs.exceptions import FileFormatError, FrameError, WPDCWarning
-from wpdc_gwcs.io import read_frames, read_wcs
+from wpdc_gwcs.io import read, read_frames, read_wcs
 from wpdc_gwcs.io.celestial import parse_wcs
 from wpdc_gwcs.io.dates import header_epoch, header_start, read_epoch
 from wpdc_gwcs.io.headers import (
@@ -24,6 +25,7 @@ from wpdc_gwcs.io.headers import (
     positive_number,
     read_headers,
 )
+from wpdc_gwcs.io.ldac import write_ldac
 from wpdc_gwcs.io.tan import parse_tan
 from wpdc_gwcs.models import PVPolynomial, project, pv_terms
 from wpdc_gwcs.models.attitude import fold_attitude
@@ -726,3 +728,30 @@ def test_dates_that_make_no_sense(cards, year, message):
     with pytest.warns(WPDCWarning, match=f"a.fits: dates that make no sense.*{message}"):
         got = epoch(**cards)
     assert got == (None if year is None else pytest.approx(year, abs=1e-5))
+
+
+def test_a_list_has_the_header_of_its_image(tmp_path):
+    """As written by simulations and, with one string for the header, by SExtractor."""
+    header = tpv_header()
+    header["NAXIS"], header["NAXIS1"], header["NAXIS2"] = 2, 2048, 2000
+    objects = Table({"X_IMAGE": [1.0], "Y_IMAGE": [2.0]})
+    write_ldac(objects, header, tmp_path / "a.ldac")
+    x, y = np.random.default_rng(1).uniform(0, 2000, (2, 50))
+    truth = WCS(header).all_pix2world(x, y, 0)
+    for path in (tmp_path / "a.ldac", f"{tmp_path / 'a.ldac'}[LDAC_OBJECTS]"):
+        (found,) = read_headers(path)
+        assert header_shape(found) == (2000, 2048)
+        np.testing.assert_allclose(read_wcs(path)(x, y), truth, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(read(path).wcs(x, y), truth, rtol=0, atol=1e-10)
+    # An image whose own header points elsewhere starts from it.
+    wrong = tpv_header(CRVAL1=20.0)
+    fits.writeto(tmp_path / "a.fits", np.zeros((2000, 2048), np.int16), wrong)
+    (frame,) = read_frames(tmp_path / "a.fits", wcs=tmp_path / "a.ldac")
+    found = frame.wcs.pixel_to_world_values(x, y)
+    np.testing.assert_allclose(found, truth, rtol=0, atol=1e-8)
+
+
+def test_a_list_without_a_wcs_is_refused(tmp_path):
+    write_ldac(Table({"X_IMAGE": [1.0]}), fits.Header({"OBJECT": "a"}), tmp_path / "a.ldac")
+    with pytest.raises(FileFormatError, match="must hold a header with CTYPE1"):
+        read_headers(tmp_path / "a.ldac")

@@ -591,10 +591,7 @@ def test_signals_end_all_processes_quietly(inputs, tmp_path, number, to_all):
         assert time.monotonic() - began < 10
     assert process.returncode == (-9 if number == signal.SIGKILL else 128 + number)
     expected = (
-        ""
-        if number == signal.SIGKILL
-        else "wpdc: error: interrupted; files already written are complete; "
-        "continue with --resume\n"
+        "" if number == signal.SIGKILL else "wpdc: error: interrupted; nothing has been written\n"
     )
     assert errors == expected
     assert output == ""
@@ -603,6 +600,33 @@ def test_signals_end_all_processes_quietly(inputs, tmp_path, number, to_all):
         time.sleep(0.1)
     assert processes_of(process.pid) == []
     assert check_sets(out) == runs
+
+
+def test_an_interrupt_tells_whether_there_are_results(inputs, tmp_path, monkeypatch, capsys):
+    paths, reference = inputs
+    out = tmp_path / "out"
+    arguments = [*map(str, paths), "--catalog", str(reference), "--output", str(out), "-q"]
+    true = ResultFolder.write
+
+    def interrupt(*given, **options):
+        raise KeyboardInterrupt
+
+    def write_and_interrupt(self, *given):
+        true(self, *given)
+        raise KeyboardInterrupt
+
+    for write, message in (
+        (interrupt, "nothing has been written"),
+        (write_and_interrupt, "files already written are complete; continue with --resume"),
+    ):
+        monkeypatch.setattr(ResultFolder, "write", write)
+        assert command(["calibrate", *arguments]) == 130
+        assert capsys.readouterr().err == f"wpdc: error: interrupted; {message}\n"
+        assert len(list(out.glob("*.wcs.asdf"))) == (0 if write is interrupt else 3)
+    # Before the run itself.
+    monkeypatch.setattr("wpdc_gwcs.io.read_files", interrupt)
+    assert command(["calibrate", *arguments, "--overwrite"]) == 130
+    assert capsys.readouterr().err == "wpdc: error: interrupted; nothing has been written\n"
 
 
 def test_a_full_disk_leaves_nothing(inputs, tmp_path):

@@ -123,7 +123,10 @@ class ResultFolder:
             raise
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, kind, error, traceback):
+        if isinstance(error, KeyboardInterrupt):
+            # For the message of the command that is interrupted.
+            error.has_results = bool(self._rows)
         try:
             self._tidy()
         finally:

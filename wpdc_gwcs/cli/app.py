@@ -22,7 +22,7 @@ from typer.core import TyperGroup
 from wpdc_gwcs.cli.hints import hint_of, similar_option
 from wpdc_gwcs.exceptions import FrameFailure, InputError, WPDCError, WPDCWarning
 
-__all__ = ["app", "main", "set_verbosity"]
+__all__ = ["Interrupted", "app", "main", "set_verbosity"]
 
 # As they are listed: from frames to results, then what is around it.
 _ORDER = (
@@ -52,6 +52,10 @@ app = typer.Typer(
 UsageError = typer.BadParameter.__bases__[0]
 
 _INTERRUPTED = 130
+
+
+class Interrupted(Exception):
+    """An interrupt in a command that can be resumed, after it has written results."""
 
 
 def _show_version(value: bool):
@@ -201,10 +205,14 @@ def _run(args, received):
         return _fail(err, 2, args)
     except (FrameFailure, WPDCError) as err:
         return _fail(err, 1, args)
-    except (KeyboardInterrupt, typer.Abort):
+    except (KeyboardInterrupt, typer.Abort, Interrupted) as stop:
         status = 128 + received[0] if received else _INTERRUPTED
-        more = "; continue with --resume" if "--resume" in _options_of(args) else ""
-        return _fail(f"interrupted; files already written are complete{more}", status)
+        done = "files already written are complete"
+        if isinstance(stop, Interrupted):
+            done += "; continue with --resume"
+        elif "--resume" in _options_of(args):
+            done = "nothing has been written"
+        return _fail(f"interrupted; {done}", status)
     except BrokenPipeError:
         # The reader of our output is gone, which is not an error; the exit must not flush again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -10,8 +10,9 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from wpdc_gwcs.cli.app import app
+from wpdc_gwcs.cli.app import Interrupted, app
 from wpdc_gwcs.cli.completion import complete, one_of
+from wpdc_gwcs.cli.files import read_stored
 from wpdc_gwcs.cli.hints import hint_of_frame
 from wpdc_gwcs.cli.inputs import expand_paths
 from wpdc_gwcs.cli.options import (
@@ -65,7 +66,8 @@ WcsFile = Annotated[
     typer.Option(
         "--wcs",
         metavar="HEADER",
-        help="Starting WCS of source tables: FITS file[EXT], text header or .head file.",
+        help="Starting WCS instead of the frame's own: for an image with a wrong header, and for "
+        "tables of sources; FITS file[EXT], FITS_LDAC list, text header or .head file.",
     ),
 ]
 
@@ -333,24 +335,30 @@ def calibrate_command(
     if stars is catalog:
         require_catalog_file(catalog)
     cluster = nullcontext() if scheduler is None else cluster_executor(scheduler, scheduler_timeout)
-    with cluster as pool, progress_bar(quiet=quiet) as progress:
-        loaded = read_files(paths, progress=progress, wcs=wcs, detector=detector, **keys)
-        run = calibrate(
-            loaded,
-            stars,
-            solution=stored,
-            update=update,
-            settings=settings,
-            jobs=jobs,
-            executor=pool,
-            output=output,
-            overwrite=overwrite,
-            resume=resume,
-            keep=False,
-            progress=progress,
-        )
-    if report:
-        write_page(output, page, overwrite=overwrite or resume)
+    run = None
+    try:
+        with cluster as pool, progress_bar(quiet=quiet) as progress:
+            loaded = read_files(paths, progress=progress, wcs=wcs, detector=detector, **keys)
+            run = calibrate(
+                loaded,
+                stars,
+                solution=stored,
+                update=update,
+                settings=settings,
+                jobs=jobs,
+                executor=pool,
+                output=output,
+                overwrite=overwrite,
+                resume=resume,
+                keep=False,
+                progress=progress,
+            )
+        if report:
+            write_page(output, page, overwrite=overwrite or resume)
+    except KeyboardInterrupt as stop:
+        if run is None and not getattr(stop, "has_results", False):
+            raise
+        raise Interrupted from stop
     if not quiet:
         if resume:
             typer.echo(
@@ -394,24 +402,16 @@ def stored_solutions(paths):
     DistortionSolution or dict or None
         A single solution, or several by the names of their detectors; `None` without files.
     """
-    from wpdc_gwcs.camera import Camera
-    from wpdc_gwcs.io import read
     from wpdc_gwcs.solution import DistortionSolution
 
     found, source = {}, {}
     single = None
     for path in paths:
-        if path.is_dir():
-            inside = [*sorted(path.glob("*.camera.asdf")), *sorted(path.glob("*.solution.asdf"))]
-            hint = f"; try --solution {inside[0]}" if inside else ""
-            raise InputError(f"{path}: --solution must be a file, is a folder{hint}")
-        stored = read(path)
+        stored = read_stored(path, "--solution")
         if isinstance(stored, DistortionSolution):
             single, several = stored, {stored.detector: stored}
-        elif isinstance(stored, Camera):
-            several = stored.solutions
         else:
-            raise InputError(f"{path}: --solution needs a *.solution.asdf or *.camera.asdf file")
+            several = stored.solutions
         for name, one in several.items():
             if name in found:
                 raise InputError(

@@ -83,6 +83,14 @@ def export_command(
             **one_of("keep", "remove"), help="With --into: keep or remove alternate WCSs."
         ),
     ] = "keep",
+    any_exposure: Annotated[
+        bool,
+        typer.Option(
+            "--any-exposure",
+            help="With --into: do not compare the date, the detector and the field of the image "
+            "with those of FILE.",
+        ),
+    ] = False,
     overwrite: Overwrite = False,
     verbose: Verbose = 0,
     quiet: Quiet = False,
@@ -104,8 +112,8 @@ def export_command(
         raise InputError(f"--alternates must be keep or remove, got {alternates!r}")
     if into is not None:
         if output is not None:
-            require_free(output, overwrite)
-        lines = _into(files, into, format, degree, output, alternates, overwrite)
+            require_free(output, overwrite, format=format)
+        lines = _into(files, into, format, degree, output, alternates, any_exposure, overwrite)
     else:
         lines = _one_by_one(files, output, format, degree, overwrite)
     for line in lines:
@@ -118,7 +126,7 @@ def _one_by_one(files, output, format, degree, overwrite):
     found = wcs_files(files)
     places = _places(found, output, format, in_folder=found != files or len(files) > 1)
     for place in places.values():
-        require_free(place, overwrite)
+        require_free(place, overwrite, format=format)
     for file, place in places.items():
         calibration = read_one(file)
         with _as_input_error():
@@ -150,9 +158,10 @@ def _places(files, output, format, *, in_folder):
     return places
 
 
-def _into(files, image, format, degree, output, alternates, overwrite):
+def _into(files, image, format, degree, output, alternates, any_exposure, overwrite):
     """Write one WCS into an image, or all of its extensions at once; return what to print."""
     from wpdc_gwcs.catalogs.files import split_extension
+    from wpdc_gwcs.io.assignment import require_same_exposure
     from wpdc_gwcs.io.embed import INTO_FORMS, image_numbers, write_into
 
     if format not in INTO_FORMS:
@@ -167,10 +176,12 @@ def _into(files, image, format, degree, output, alternates, overwrite):
         )
     target = image if output is None else output
     if folder or len(files) > 1 or (extension is None and len(image_numbers(path)) > 1):
-        given, owners = _calibrations_of(files, path)
+        given, owners = _calibrations_of(files, path, any_exposure)
         places = [f"{target}[{number}]: {owners[number].name}" for number in given]
     else:
         given, places = read_one(files[0]), [f"{target}:"]
+        if not any_exposure:
+            require_same_exposure(image, files[0], given)
     with _as_input_error():
         made = write_into(
             given,
@@ -187,7 +198,7 @@ def _into(files, image, format, degree, output, alternates, overwrite):
     ]
 
 
-def _calibrations_of(files, image):
+def _calibrations_of(files, image, any_exposure):
     """Calibrations for the extensions of an image by their numbers, and the files they are from."""
     from wpdc_gwcs.io.assignment import assign_extensions, frames_of_image
 
@@ -200,7 +211,7 @@ def _calibrations_of(files, image):
             raise InputError(f"{file}: has no WCS file of {image}, such as {names[0]}")
         found += inside
     calibrations = {file: read_one(file) for file in dict.fromkeys(found)}
-    owners = assign_extensions(image, frames, calibrations)
+    owners = assign_extensions(image, frames, calibrations, any_exposure=any_exposure)
     left = [frames[number].name for number in sorted(set(frames) - set(owners))]
     if left:
         log.warning("%s: no WCS for %s: left as it was", image, listed(left, kind="frames"))
@@ -302,7 +313,7 @@ def convert_command(
         raise InputError(f"--to must be one of {', '.join(formats)}, got {to!r}")
     if size is not None and min(size) < 2:
         raise InputError(f"--size must be two numbers of 2 or more, got {size[0]} {size[1]}")
-    require_free(output, overwrite)
+    require_free(output, overwrite, format=to)
     found = read_any(file, image_shape=None if size is None else size[::-1])
     if isinstance(found, Camera):
         raise InputError(

@@ -27,6 +27,8 @@ Output = Annotated[
     typer.Option("--output", metavar="FILE", help="Write the table here instead of printing it."),
 ]
 
+_DEG_PER_HOUR = 15.0
+
 
 def read_one(file):
     """Read a file with a single WCS.
@@ -51,6 +53,45 @@ def read_one(file):
             f"for example {file.parent / found.files[found.reference]}"
         )
     return found
+
+
+def read_stored(path, what):
+    """Read a stored solution, or those of a camera.
+
+    Parameters
+    ----------
+    path : Path
+        Their file.
+    what : str
+        Option or command that needs it, for messages.
+
+    Returns
+    -------
+    DistortionSolution or Camera
+        The content of the file.
+
+    Raises
+    ------
+    InputError
+        If the file is of another kind, or cannot be read.
+    """
+    from wpdc_gwcs.camera import Camera
+    from wpdc_gwcs.io import read
+    from wpdc_gwcs.io.files import file_kind
+    from wpdc_gwcs.solution import DistortionSolution
+
+    stored = None
+    # A file that is not ASDF cannot be one, and what a reader of headers says of it does not help.
+    if not path.is_dir() and file_kind(path) == "asdf":
+        stored = read(path)
+    if isinstance(stored, DistortionSolution | Camera):
+        return stored
+    folder = path if path.is_dir() else path.parent
+    inside = [*sorted(folder.glob("*.camera.asdf")), *sorted(folder.glob("*.solution.asdf"))]
+    option = f"{what} " if what.startswith("--") else ""
+    hint = f"; try: {option}{inside[0]}" if inside else ""
+    kind = ", is a folder" if path.is_dir() else ""
+    raise InputError(f"{path}: {what} needs a *.solution.asdf or *.camera.asdf file{kind}{hint}")
 
 
 @app.command(
@@ -107,7 +148,8 @@ def sky2pix_command(
 def _transform(file, points, origin, output, overwrite, *, forward):
     if origin not in (0, 1):
         raise InputError(f"--origin must be 0 or 1, got {origin}")
-    wcs = read_one(file).wcs
+    calibration = read_one(file)
+    wcs = calibration.wcs
     names = ("x", "y", "ra", "dec") if forward else ("ra", "dec", "x", "y")
 
     def transform(a, b):
@@ -122,12 +164,32 @@ def _transform(file, points, origin, output, overwrite, *, forward):
     read_point = _read_pixel if forward else _read_sky
     result = [float(value) for value in transform(*read_point(points))]
     if not np.all(np.isfinite(result)):
-        where = "detector" if forward else "sky of the detector"
+        where = "detector"
+        if not forward:
+            where = f"sky of the detector{_center(calibration)}{_if_in_hours(points, wcs)}"
         typer.echo("nan nan")
         typer.echo(f"wpdc: error: {' '.join(points)} is outside the {where}", err=True)
         raise typer.Exit(1)
     digits = 10 if forward else 5
     typer.echo(" ".join(f"{value:.{digits}f}" for value in result))
+
+
+def _center(calibration):
+    """Center of the detector on the sky, in words."""
+    shape = getattr(calibration, "solution", calibration).image_shape
+    if shape is None:
+        return ""
+    ra, dec = calibration.wcs(*((n - 1) / 2 for n in reversed(shape)))
+    return f", whose center is RA {float(ra):.5f} Dec {float(dec):+.5f} deg"
+
+
+def _if_in_hours(points, wcs):
+    """Hint for a plain number of hours as right ascension."""
+    ra, dec = _read_sky(points)
+    word = _two_words(points, ("ra", "dec"))[0]
+    if not _is_number(word) or not np.all(np.isfinite(wcs.invert(_DEG_PER_HOUR * ra, dec))):
+        return ""
+    return f"; if {word} is in hours, RA is {_DEG_PER_HOUR * ra:.5f} deg, which is inside: give deg"
 
 
 def _read_pixel(points):

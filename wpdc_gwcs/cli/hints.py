@@ -46,8 +46,8 @@ _OF_COMMANDS = (
         "the output folder of wpdc calibrate",
     ),
     (
-        r".*monitor needs a \*\.solution\.asdf",
-        "the --solution of the frames",
+        r"[^;]*needs a \*\.solution\.asdf or \*\.camera\.asdf file[^;]*$",
+        "the file of this name that wpdc calibrate has written",
     ),
     (
         r"(?P<path>.+?): (?:catalog must be an existing file|must be a readable file: No such file"
@@ -82,7 +82,7 @@ _OF_COMMANDS = (
         "wpdc show {path}, which says what it is",
     ),
     (
-        r"(?P<path>.+?): must have a 'wpdc' tree|(?P<other>.+?): --solution needs",
+        r"(?P<path>.+?): must have a 'wpdc' tree",
         "wpdc show {path}, which says what it is",
     ),
     (r"(?P<path>.+?): .*\bthe manifest of a run", "wpdc show {folder}"),
@@ -101,6 +101,10 @@ _OF_COMMANDS = (
     ),
     (r"--scheduler .*: no Dask scheduler", "dask scheduler, which prints its address"),
     (r"a distortion of .* is not invertible", "a smaller --distortion, or a larger --size"),
+    (
+        r".*: not the same (?:exposure|detector)",
+        "--any-exposure if the header of the image is wrong, or the WCS file of this image",
+    ),
     (r".*would both write", "different names, or one run for each of them"),
     (r"exposure .*left out|all \d+ exposures were left out", "wpdc explain FRAME --catalog CAT"),
 )
@@ -151,7 +155,7 @@ def hint_of(message, command=""):
         found = re.match(pattern, message, re.DOTALL)
         if found:
             parts = found.groupdict()
-            path = parts.get("path") or parts.get("other") or ""
+            path = parts.get("path") or ""
             if hint == "_similar":
                 return _similar(path)
             folder = shlex.quote(str(Path(path).parent))

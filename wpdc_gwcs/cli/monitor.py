@@ -1,5 +1,7 @@
 """`wpdc monitor`: test whether a stored solution still holds, now and over a survey."""
 
+import logging
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -8,14 +10,26 @@ import numpy as np
 import typer
 
 from wpdc_gwcs.cli.app import app
-from wpdc_gwcs.cli.files import match_files, read_with_wcs, wcs_beside
+from wpdc_gwcs.cli.files import match_files, read_stored, read_with_wcs, wcs_beside
 from wpdc_gwcs.cli.options import Overwrite, Quiet, Verbose, require_free, require_plotting
 from wpdc_gwcs.counts import counted
-from wpdc_gwcs.exceptions import InputError
+from wpdc_gwcs.exceptions import FitError, InputError
+
+log = logging.getLogger("wpdc_gwcs.cli")
 
 # Maximum number of periods that are reported one by one.
 _MOST_PERIODS = 40
 _MOST_CELLS = 5
+# What is said of frames whose residuals are not simply about the stored solution.
+_OTHER_MAP = (
+    "calibrated with another map than the stored one, so the residuals about the stored one were "
+    "computed from their stars"
+)
+_NOT_CHECKED = (
+    "no *.wcs.asdf file beside the match table, so it cannot be checked whether the frame was "
+    "calibrated with this solution"
+)
+_LEFT_OUT = "left out: calibrated with another map, and too few stars for an attitude"
 
 
 @app.command(
@@ -35,7 +49,7 @@ def monitor_command(
         list[Path],
         typer.Argument(
             metavar="MATCHES...",
-            help="Results of frames calibrated with it: *.matches.ecsv, *.wcs.asdf or folders.",
+            help="Results of frames of its detectors: *.matches.ecsv, *.wcs.asdf or folders.",
         ),
     ],
     every: Annotated[
@@ -68,10 +82,11 @@ def monitor_command(
 ):
     """Test whether a stored solution is still valid.
 
-    The exit status is 1 if it is not.  The frames must have been calibrated with it: wpdc calibrate
-    --solution SOLUTION.  The part of a change that the fields of single exposures have absorbed is
-    added back.  All detectors of a camera are tested, and --false-alarm is shared by all detectors
-    and periods.
+    The exit status is 1 if it is not.  The frames should have been calibrated with it: wpdc
+    calibrate --solution SOLUTION.  For others, the residuals about it are computed from the
+    positions of their stars.  The part of a change that the fields of single exposures have
+    absorbed is added back.  All detectors of a camera are tested, and --false-alarm is shared by
+    all detectors and periods.
     """
     from wpdc_gwcs.calibration.names import file_stem
     from wpdc_gwcs.io import write_table
@@ -84,7 +99,7 @@ def monitor_command(
         raise InputError(f"--false-alarm must be between 0 and 1, got {false_alarm:g}")
     cells_file = None
     if output is not None:
-        require_free(output, overwrite)
+        require_free(output, overwrite, format="ecsv")
         if every is not None:
             cells_file = output.with_suffix(f".cells{output.suffix}")
             require_free(cells_file, overwrite)
@@ -101,21 +116,24 @@ def monitor_command(
         named = ", ".join(sorted({str(f.detector) for f in frames})[:6])
         raise InputError(
             f"{solution}: is for detector {', '.join(solutions)}, the frames are from {named}: use "
-            "the solution that they were calibrated with"
+            "a solution of their detector"
         )
     periods = {name: _periods(found, every) for name, found in mine.items() if found}
     share = false_alarm / sum(map(len, periods.values()))
     drifted, rows, cells = False, [], []
     for name, parts in periods.items():
+        notes = {}
+        drift = history = None
         if every is None:
-            drift = _test(solutions[name], parts[0], share)
+            drift = _test(solutions[name], parts[0], share, notes)
+        if every is not None or plots is not None:
+            history = _follow(solutions[name], parts, share, notes)
+        _warn(solutions[name], mine[name], notes)
+        if every is None:
             drifted |= drift.drifted
             cells.append(_named(drift.cells, name))
             if not quiet:
                 _tell(name, drift, len(parts[0]))
-        history = None
-        if every is not None or plots is not None:
-            history = _follow(solutions[name], parts, share)
         if every is not None:
             drifted |= bool(len(history.alarms))
             rows.append(_named(history.periods, name))
@@ -145,25 +163,36 @@ class _MonitoredFrame:
     detector: str | None
     epoch: float
 
-    def matches(self):
-        """Read the residuals, with the part that a field has absorbed added back."""
-        from wpdc_gwcs.evaluation import residuals_of_attitude
+    def matches(self, solution, notes):
+        """Read the residuals about a solution; note what is said of the frame, by its path."""
+        from wpdc_gwcs.evaluation import has_map_of, residuals_of_attitude
 
         table, calibration = read_with_wcs(self.path)
-        return table if calibration is None else residuals_of_attitude(calibration, table)
+        if calibration is None:
+            notes[self.path] = _NOT_CHECKED
+            return table
+        shape = calibration.solution.image_shape
+        if shape != solution.image_shape:
+            raise InputError(
+                f"{self.path}: must have the shape (ny, nx) of the stored solution, "
+                f"{solution.image_shape}, has {shape}; give frames of this shape only"
+            )
+        if not has_map_of(calibration, solution):
+            notes[self.path] = _OTHER_MAP
+        try:
+            return residuals_of_attitude(calibration, table, solution=solution)
+        except FitError:
+            notes[self.path] = _LEFT_OUT
+            return table[:0]
 
 
 def _solutions(path):
-    from wpdc_gwcs.camera import Camera
-    from wpdc_gwcs.io import read
     from wpdc_gwcs.solution import DistortionSolution
 
-    stored = read(path)
+    stored = read_stored(path, "monitor")
     if isinstance(stored, DistortionSolution):
         return {stored.detector: stored}
-    if isinstance(stored, Camera):
-        return dict(stored.solutions)
-    raise InputError(f"{path}: monitor needs a *.solution.asdf file or a *.camera.asdf file")
+    return dict(stored.solutions)
 
 
 def _frames(paths, *, need_epochs):
@@ -223,20 +252,43 @@ def _periods(frames, every):
     return [[frames[k] for k in part] for part in parts]
 
 
-def _test(solution, frames, false_alarm):
+def _test(solution, frames, false_alarm, notes):
     from wpdc_gwcs.evaluation import detect_drift
 
+    tables = (f.matches(solution, notes) for f in frames)
     try:
-        return detect_drift(solution, (f.matches() for f in frames), false_alarm=false_alarm)
+        return detect_drift(solution, tables, false_alarm=false_alarm)
     except ValueError as err:
         raise InputError(f"{solution.detector}: {err}") from err
 
 
-def _follow(solution, periods, false_alarm):
+def _follow(solution, periods, false_alarm, notes):
     from wpdc_gwcs.evaluation import track_drift
 
-    told = (([f.epoch for f in part], [f.matches() for f in part]) for part in periods)
+    told = (
+        ([f.epoch for f in part], [f.matches(solution, notes) for f in part]) for part in periods
+    )
     return track_drift(solution, told, false_alarm=false_alarm)
+
+
+def _warn(solution, frames, notes):
+    """Warn of frames that were not calibrated with the solution, or are not of its time."""
+    for note, n in Counter(notes.values()).items():
+        first = next(path for path, text in notes.items() if text == note)
+        log.warning("%s: %s: %s", solution.detector, _share(n, frames, first), note)
+    outside = [f for f in frames if np.isfinite(f.epoch) and not solution.holds_at(f.epoch)]
+    if outside:
+        log.warning(
+            "%s: %s: of another time than the stored solution, which is valid %s",
+            solution.detector,
+            _share(len(outside), frames, outside[0].path),
+            solution.validity,
+        )
+
+
+def _share(n, frames, first):
+    also = ", ..." if n > 1 else ""
+    return f"{n} of {counted(len(frames), 'frame')} ({first}{also})"
 
 
 def _tell(name, drift, n_frames):

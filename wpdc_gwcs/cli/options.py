@@ -351,8 +351,8 @@ def state_first_pixel(frames):
         )
 
 
-def require_free(path, overwrite):
-    """Raise an error if a file exists and may not be replaced.
+def require_free(path, overwrite, *, format=None):
+    """Raise an error if a file exists and may not be replaced, or has the suffix of another format.
 
     Parameters
     ----------
@@ -360,7 +360,13 @@ def require_free(path, overwrite):
         File that will be written.
     overwrite : bool
         Whether it may be replaced.
+    format : str, optional
+        Format that will be written, as for `wpdc_gwcs.io.write`.  Default: any.
     """
+    from wpdc_gwcs.io.files import check_suffix
+
+    if format is not None:
+        check_suffix(path, format)
     if path.exists() and not overwrite:
         raise InputError(f"{path}: file exists, and is replaced only with --overwrite")
 

@@ -89,7 +89,7 @@ def detect_command(
     from wpdc_gwcs.calibration import measure_sources
     from wpdc_gwcs.io import write_table
 
-    require_free(output, overwrite)
+    require_free(output, overwrite, format="ecsv")
     settings = settings_of(
         centroids=centroids,
         threshold=threshold,
@@ -147,7 +147,7 @@ def match_command(
     from wpdc_gwcs.io import write_table
     from wpdc_gwcs.matching import pair_table
 
-    require_free(output, overwrite)
+    require_free(output, overwrite, format="ecsv")
     settings = settings_of(
         blind=blind,
         min_snr=min_snr,

@@ -1,10 +1,10 @@
 """Residuals of frames, detectors and runs; radial weights; drift; comparison with a truth."""
 
+from wpdc_gwcs.evaluation.attitude import has_map_of, residuals_of_attitude
 from wpdc_gwcs.evaluation.cuts import Cuts
 from wpdc_gwcs.evaluation.drift import Drift, detect_drift
 from wpdc_gwcs.evaluation.history import (
     DriftHistory,
-    residuals_of_attitude,
     split_periods,
     track_drift,
 )
@@ -40,6 +40,7 @@ __all__ = [
     "detect_drift",
     "evaluate",
     "format_table",
+    "has_map_of",
     "pool_residuals",
     "pool_scores",
     "residuals_of_attitude",

@@ -109,8 +109,10 @@ def detect_drift(solution, matches, *, false_alarm=0.01):
     solution : DistortionSolution
         The stored solution.
     matches : `~astropy.table.Table` or iterable of them
-        Match tables of frames that were calibrated with this solution (attitude only): columns
-        ``x``, ``y``, ``dx``, ``dy``, ``x_err``, ``y_err`` in px.
+        Match tables with residuals about this solution: columns ``x``, ``y``, ``dx``, ``dy``,
+        ``x_err``, ``y_err`` in px.  Tables of frames that were calibrated with it, attitude only,
+        have them; for any others, with fields or solutions of their own,
+        `~wpdc_gwcs.evaluation.residuals_of_attitude` computes them.
     false_alarm : float, optional
         Accepted probability of reporting a change where there is none.
 

@@ -13,14 +13,12 @@ from astropy.table import QTable, Table
 from wpdc_gwcs.evaluation.drift import detect_drift, mean_in_cells
 from wpdc_gwcs.evaluation.residuals import evaluate
 
-__all__ = ["DriftHistory", "residuals_of_attitude", "split_periods", "track_drift"]
+__all__ = ["DriftHistory", "split_periods", "track_drift"]
 
 # Cells along each side whose means are tracked: small enough to locate a change, large enough to
 # have stars every night.
 _GRID = 4
 _DAYS_PER_YEAR = 365.25
-# Minimum number of stars to fit the six numbers of an attitude and have some to spare.
-_LEAST_STARS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,60 +110,6 @@ def split_periods(epochs, days):
     return [order[number[order] == k] for k in np.unique(number)]
 
 
-def residuals_of_attitude(calibration, matches):
-    """Return the residuals that a frame would have without its own field.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        Calibration of the frame.
-    matches : `~astropy.table.Table`
-        Its matches.
-
-    Returns
-    -------
-    `~astropy.table.Table`
-        The matches, or a copy with the field added back to ``dx`` and ``dy`` without its linear
-        part, which the attitude absorbs.  This is needed because a field also absorbs a drift.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from astropy.table import Table
-    >>> from wpdc_gwcs import Calibration, DistortionSolution, LookupTable, PVPolynomial
-    >>> from wpdc_gwcs.evaluation import residuals_of_attitude
-    >>> cd, crpix, crval = np.diag([-2e-5, 2e-5]), np.array([499.5, 499.5]), np.array([10.0, 20.0])
-    >>> solution = DistortionSolution("d", (1000, 1000), crpix, cd, crval, PVPolynomial())
-    >>> grid = np.linspace(-0.5, 999.5, 20)
-    >>> shift = np.tile(0.1 * np.sin(grid / 100), (20, 1))
-    >>> wave = LookupTable(grid, grid, shift, 0 * shift)
-    >>> frame = Calibration("a", solution, crval=crval, cd=cd, field=wave)
-    >>> x, y = np.random.default_rng(1).uniform(0, 999, (2, 500))
-    >>> matches = Table({"x": x, "y": y, "dx": 0 * x, "dy": 0 * x, "used": x >= 0})
-    >>> matches["x_err"] = matches["y_err"] = 0.05
-    >>> without_field = residuals_of_attitude(frame, matches)
-    >>> float(matches["dx"].std()), float(without_field["dx"].std().round(2))
-    (0.0, 0.07)
-    """
-    if calibration.field is None:
-        return matches
-    x, y = (np.asarray(matches[name], float) for name in ("x", "y"))
-    used = np.asarray(matches["used"], bool)
-    found = matches.copy()
-    rows = np.stack([np.ones_like(x), *(2 * c / c.max(initial=1.0) - 1 for c in (x, y))], axis=1)
-    for axis, field in zip("xy", calibration.field(x, y), strict=True):
-        residual = np.asarray(matches[f"d{axis}"], float) + field
-        error = np.asarray(matches[f"{axis}_err"], float)
-        good = used & np.isfinite(residual) & (error > 0)
-        if good.sum() >= _LEAST_STARS:
-            weight = 1.0 / error[good, None]
-            linear = np.linalg.lstsq(rows[good] * weight, residual[good] * weight[:, 0])[0]
-            residual = residual - rows @ linear
-        found[f"d{axis}"] = residual
-        found[f"d{axis}"].unit = matches[f"d{axis}"].unit
-    return found
-
-
 def track_drift(solution, periods, *, false_alarm=0.01):
     """Test a stored solution over time, period by period.
 
@@ -175,7 +119,8 @@ def track_drift(solution, periods, *, false_alarm=0.01):
         The stored solution.
     periods : iterable of (epochs, matches)
         Epochs of the frames of a period (Julian years or NaN), and their match tables as for
-        `detect_drift`.  Periods are processed one by one and not kept.
+        `detect_drift`: of frames that were calibrated with this solution, or else from
+        `residuals_of_attitude`.  Periods are processed one by one and not kept.
     false_alarm : float, optional
         Accepted probability of an alarm in a period without a change; for many periods, divide
         the total by their number.

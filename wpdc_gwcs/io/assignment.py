@@ -1,4 +1,4 @@
-"""Which extension of an image a calibration belongs to."""
+"""Assignment of calibrations to images: whether they belong together, and to which extension."""
 
 import re
 import warnings
@@ -7,19 +7,26 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 
 from wpdc_gwcs.columns import listed
+from wpdc_gwcs.detector import UNNAMED
 from wpdc_gwcs.exceptions import InputError, WPDCWarning
+from wpdc_gwcs.io.dates import EXPOSURE_KEYS, header_epoch
 from wpdc_gwcs.io.embed import image_numbers
-from wpdc_gwcs.io.files import open_fits
+from wpdc_gwcs.io.files import open_fits, split_extension, stem_of
 from wpdc_gwcs.io.frames import read_frames
-from wpdc_gwcs.io.headers import extension_names
+from wpdc_gwcs.io.headers import extension_names, find_extension, header_text, positive_number
+from wpdc_gwcs.io.identity import detector_names, file_name
 
-__all__ = ["assign_extensions", "frames_of_image"]
+__all__ = ["assign_extensions", "frames_of_image", "require_same_exposure"]
 
 # The header of an extension may point this far from its calibration, in diagonals of the detector:
 # more than any match allows, less than the distance of another exposure.
 _MAX_OFFSET = 1.0
 # Epochs of an exposure agree to this, in years (3 s): another exposure takes longer than that.
 _SAME_EPOCH = 1e-7
+# A copy may have the start or the end of the exposure as its date, instead of the middle.  The
+# middle of another exposure is at least a whole exposure time away.
+_SHARE_OF_EXPOSURE = 0.5
+_SECONDS_PER_YEAR = 365.25 * 86400
 _NUMBER = re.compile(r"\[(\d+)\]$")
 
 
@@ -60,7 +67,7 @@ def frames_of_image(image):
     return dict(zip(numbers, frames, strict=True))
 
 
-def assign_extensions(image, frames, calibrations):
+def assign_extensions(image, frames, calibrations, *, any_exposure=False):
     """Find the calibration of each extension, by the name of its frame or else of its detector.
 
     Parameters
@@ -72,6 +79,8 @@ def assign_extensions(image, frames, calibrations):
     calibrations : dict
         Name for messages to `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`.  A renamed
         image is recognized by its detectors.
+    any_exposure : bool, optional
+        Whether calibrations of other times and fields are accepted.
 
     Returns
     -------
@@ -90,8 +99,8 @@ def assign_extensions(image, frames, calibrations):
     for name, one in calibrations.items():
         solution = getattr(one, "solution", one)
         number = by_frame.get(getattr(one, "frame", None))
-        if number is None and (number := by_detector.get(solution.detector)) is not None:
-            _require_same_epoch(f"{image}[{number}]", frames[number], name, one)
+        if number is None:
+            number = by_detector.get(solution.detector)
         if number is None:
             raise InputError(
                 f"{name}: is of frame {getattr(one, 'frame', None)} and detector "
@@ -103,20 +112,75 @@ def assign_extensions(image, frames, calibrations):
             raise InputError(
                 f"{found[number]} and {name} both belong to {image}[{number}]; give one"
             )
-        if one is not solution:
-            _require_same_field(f"{image}[{number}]", frames[number], name, one)
+        if not any_exposure:
+            frame, place = frames[number], f"{image}[{number}]"
+            _require_same_epoch(place, frame.epoch, frame.meta.get("exptime"), name, one)
+            if one is not solution:
+                _require_same_field(place, frame, name, one)
         found[number] = name
     return {number: found[number] for number in sorted(found)}
 
 
-def _require_same_epoch(place, frame, name, calibration):
-    epochs = calibration.provenance.get("epochs") if hasattr(calibration, "frame") else None
-    if frame.epoch is None or not epochs:
+def require_same_exposure(image, name, calibration):
+    """Refuse a calibration that is not of the exposure and the detector of an image.
+
+    Parameters
+    ----------
+    image : str
+        FITS image, or ``path[EXT]``; what its headers do not tell is not compared.
+    name : path-like
+        Name of the calibration for messages.
+    calibration : `~wpdc_gwcs.Calibration` or `~wpdc_gwcs.DistortionSolution`
+        The calibration.  A solution is of no exposure.
+
+    Raises
+    ------
+    InputError
+        If the epochs or the detectors differ, or the image cannot be read.
+    """
+    path, extension = split_extension(image)
+    numbers = image_numbers(path)
+    with open_fits(path, lazy=True) as hdus:
+        number = numbers[0] if extension is None else find_extension(hdus, extension, path)
+        headers = {k: hdus[k].header.copy() for k in {0, number, *numbers}}
+    own = [headers[number], headers[0]]
+    with warnings.catch_warnings():
+        # They were given when the frame was calibrated.
+        warnings.simplefilter("ignore", WPDCWarning)
+        epoch = header_epoch(own)
+    _require_same_epoch(image, epoch, positive_number(own, EXPOSURE_KEYS), name, calibration)
+    stem, label = stem_of(path), file_name(header_text(headers[number], "EXTNAME") or str(number))
+    if getattr(calibration, "frame", None) not in (stem, f"{stem}_{label}"):
+        _require_same_detector(image, headers, number, name, calibration)
+
+
+def _require_same_detector(image, headers, number, name, calibration):
+    """Compare the detector of a calibration with the names in the headers of an image."""
+    detector = getattr(calibration, "solution", calibration).detector
+    known = {k: detector_names([header]) for k, header in headers.items()}
+    here = [*known[number].values(), *known[0].values()]
+    # A number is added to names that several detectors of a file have.
+    if detector == UNNAMED or any(f"{detector}_".startswith(f"{one}_") for one in here):
         return
-    if not min(epochs) - _SAME_EPOCH <= frame.epoch <= max(epochs) + _SAME_EPOCH:
+    # The name of an extension may be of anything, unless another one has that of the detector.  The
+    # header of the file may be about the whole camera.
+    named = [name for key, name in known[number].items() if key != "EXTNAME"]
+    elsewhere = [k for k in known if detector in known[k].values()]
+    if named or elsewhere:
         raise InputError(
-            f"{place}: is of epoch {frame.epoch:.7f}, {name} of {max(epochs):.7f}: not the same "
-            "exposure"
+            f"{image}: is of detector {(named or here or [UNNAMED])[0]}, {name} of {detector}: "
+            "not the same detector"
+        )
+
+
+def _require_same_epoch(place, epoch, exposure, name, calibration):
+    epochs = calibration.provenance.get("epochs") if hasattr(calibration, "frame") else None
+    if epoch is None or not epochs:
+        return
+    margin = _SAME_EPOCH + _SHARE_OF_EXPOSURE * (exposure or 0.0) / _SECONDS_PER_YEAR
+    if not min(epochs) - margin <= epoch <= max(epochs) + margin:
+        raise InputError(
+            f"{place}: is of epoch {epoch:.7f}, {name} of {max(epochs):.7f}: not the same exposure"
         )
 
 

@@ -23,6 +23,7 @@ __all__ = [
     "as_utf8",
     "atomic_path",
     "check_output",
+    "check_suffix",
     "file_kind",
     "first_line",
     "make_folder",
@@ -65,6 +66,17 @@ _JSON = re.compile(rb'\s*(\{\s*["}]|\[\s*["{\[])')
 _CONTROL = re.compile(rb".{0,7}\0|.*[\x01-\x08\x0e-\x1f\x7f]", re.DOTALL)
 #: Names of FITS files.
 FITS_NAME = re.compile(r"\.(fits?|fts|fz)(\.(gz|bz2|xz))?$", re.IGNORECASE)
+# Kinds of the formats that are not FITS, and suffixes that belong to one kind.
+_KINDS = {"asdf": "asdf", "stock": "asdf", "head": "head", "ecsv": "ecsv"}
+_KIND_OF_SUFFIX = {
+    ".asdf": "asdf",
+    ".head": "head",
+    ".ahead": "head",
+    ".ecsv": "ecsv",
+    ".fits": "fits",
+    ".fit": "fits",
+    ".fts": "fits",
+}
 _HEADER_NAME = re.compile(r"\.(a?head|hdr|txt)$", re.IGNORECASE)
 _STEM_SUFFIXES = re.compile(
     r"\.(fz|gz|bz2|xz|fits?|fts|cat|ldac|ecsv|csv|txt|dat|tbl|head|asdf)$", re.IGNORECASE
@@ -416,6 +428,30 @@ def _read_mandatory(file, path, error, number):
                 found[match[1].decode()] = True if value == b"T" else int(value)
         if len(block) < _BLOCK:
             raise error(f"{path}: truncated file: the header of HDU {number} does not end")
+
+
+def check_suffix(path, format):
+    """Check that the name of a file is not that of another format.
+
+    Parameters
+    ----------
+    path : path-like
+        File to be written.
+    format : {"asdf", "stock", "head", "ecsv", "fits", "cpdis", "tpv", "sip", "tab"}
+        Its format.  A suffix that belongs to no format is accepted.
+
+    Raises
+    ------
+    InputError
+        If the suffix is that of another kind of file.
+    """
+    kind = _KINDS.get(format, "fits")
+    suffix = Path(path).suffix.lower()
+    if _KIND_OF_SUFFIX.get(suffix, kind) != kind:
+        raise InputError(
+            f"{path}: the name of a file in the format {format} must end with .{kind}, ends with "
+            f"{suffix}"
+        )
 
 
 def check_output(path, *, overwrite):

@@ -29,7 +29,14 @@ from wpdc_gwcs.io.files import (
     split_extension,
     stem_of,
 )
-from wpdc_gwcs.io.headers import clean_header, find_extension, header_number, header_text, is_ours
+from wpdc_gwcs.io.headers import (
+    clean_header,
+    find_extension,
+    header_number,
+    header_of,
+    header_text,
+    is_ours,
+)
 from wpdc_gwcs.io.integrity import check_sums, check_version
 from wpdc_gwcs.io.tan import parse_tan
 from wpdc_gwcs.models import LookupTable, PVPolynomial
@@ -178,8 +185,9 @@ def read_fits(path):
             if extension is not None:
                 number = find_extension(hdus, extension, path)
             else:
-                number = _only([i for i, hdu in enumerate(hdus) if "CTYPE1" in hdu.header], path)
-            header = hdus[number].header.copy()
+                every = [header_of(hdus, i, path) for i in range(len(hdus))]
+                number = _only([i for i, one in enumerate(every) if "CTYPE1" in one], path)
+            header = header_of(hdus, number, path)
             several = len(hdus) > 1
             if is_ours(header):
                 check_sums(hdus, path)

@@ -10,7 +10,7 @@ from wpdc_gwcs.camera import Camera
 from wpdc_gwcs.exceptions import FileFormatError, WPDCWarning
 from wpdc_gwcs.export import FORMS
 from wpdc_gwcs.io.celestial import parse_wcs
-from wpdc_gwcs.io.files import check_output, file_kind, split_extension
+from wpdc_gwcs.io.files import check_output, check_suffix, file_kind, split_extension
 from wpdc_gwcs.io.headers import header_text, is_ours, read_headers
 from wpdc_gwcs.io.tan import parse_tan
 
@@ -170,7 +170,7 @@ def write(obj, path, *, format=None, degree=None, overwrite=False):
     OutputExistsError
         If the file exists and may not be replaced.
     InputError
-        If the file cannot be written.
+        If the file cannot be written, or its suffix belongs to another format.
     ValueError
         If the format is unknown, or has no polynomials of this degree.
 
@@ -199,6 +199,7 @@ def write(obj, path, *, format=None, degree=None, overwrite=False):
     if isinstance(obj, Camera) and format != "asdf":
         raise ValueError(f"a camera is written as 'asdf', got the format {format!r} for {path}")
     # Check before the work, not after.
+    check_suffix(path, format)
     check_output(path, overwrite=overwrite)
     if format in FORMS:
         from wpdc_gwcs.io.fits import write_form

@@ -31,20 +31,18 @@ from wpdc_gwcs.io.companions import (
 )
 from wpdc_gwcs.io.dates import header_epoch
 from wpdc_gwcs.io.files import (
-    READ_ERRORS,
     file_kind,
-    first_line,
     open_fits,
     split_extension,
     stem_of,
 )
 from wpdc_gwcs.io.headers import (
-    clean_header,
     extension_names,
     find_extension,
     header_shape,
     header_text,
     history_of_wcs,
+    ldac_header,
     read_headers,
 )
 from wpdc_gwcs.io.identity import (
@@ -324,7 +322,7 @@ def _prepare(hdus, where, kind, index, given, *, plane, pixel_scale, origin):
     hdu = hdus[index]
     header = hdu.header
     if kind == "list":
-        header = _ldac_header(hdus, index, where)
+        header = ldac_header(hdus, index, where, error=FrameError)
     # Keywords of the whole file stand in the primary header.
     headers = [header.copy()] + ([hdus[0].header.copy()] if index > 0 else [])
     if kind == "table" and given is not None:
@@ -394,21 +392,6 @@ def _facts_of_wcs(header):
     facts = {"projection": ", ".join(header_text(header, f"CTYPE{axis}") for axis in (1, 2))}
     history = history_of_wcs(header)
     return facts | {"wcs_origin": history} if history else facts
-
-
-def _ldac_header(hdus, index, where):
-    """Return the image header that a FITS_LDAC file carries as a table of one string."""
-    if index == 0 or hdus[index - 1].name != "LDAC_IMHEAD":
-        raise FrameError(f"{where}: LDAC_OBJECTS must follow LDAC_IMHEAD")
-    try:
-        text = np.asarray(hdus[index - 1].data).tobytes()
-    except READ_ERRORS as problem:
-        raise FrameError(f"{where}: damaged LDAC_IMHEAD: {first_line(problem)}") from problem
-    # Cards of 80 bytes without line ends.
-    headers = clean_header(b"\n".join(text[i : i + 80] for i in range(0, len(text), 80)))
-    if not headers:
-        raise FrameError(f"{where}: LDAC_IMHEAD must hold a header, is empty")
-    return headers[0]
 
 
 def _frame_of(part, path, stem, label, detector, image_shape, exposure_keyword):

@@ -4,10 +4,11 @@ import math
 import re
 import warnings
 
+import numpy as np
 from astropy.io import fits
 
 from wpdc_gwcs.exceptions import FileFormatError
-from wpdc_gwcs.io.files import file_kind, open_fits, split_extension
+from wpdc_gwcs.io.files import READ_ERRORS, file_kind, first_line, open_fits, split_extension
 
 __all__ = [
     "WRITTEN_BY_US",
@@ -15,11 +16,13 @@ __all__ = [
     "extension_names",
     "find_extension",
     "header_number",
+    "header_of",
     "header_shape",
     "header_text",
     "header_value",
     "history_of_wcs",
     "is_ours",
+    "ldac_header",
     "positive_number",
     "read_headers",
 ]
@@ -76,7 +79,8 @@ def read_headers(path):
     Returns
     -------
     headers : list of `~astropy.io.fits.Header`
-        Headers with a ``CTYPE1``, in the order of the file; independent copies.
+        Headers with a ``CTYPE1``, in the order of the file; independent copies.  A FITS_LDAC list
+        has that of its image.
 
     Raises
     ------
@@ -86,11 +90,10 @@ def read_headers(path):
     path, extension = split_extension(path)
     if file_kind(path) == "fits":
         with open_fits(path) as hdus:
-            if extension is None:
-                chosen = list(hdus)
-            else:
-                chosen = [hdus[find_extension(hdus, extension, path)]]
-            headers = [hdu.header.copy() for hdu in chosen]
+            chosen = range(len(hdus))
+            if extension is not None:
+                chosen = [find_extension(hdus, extension, path)]
+            headers = [header_of(hdus, k, path) for k in chosen]
     else:
         # Files with 80-byte cards without line ends are read the same way.
         headers = clean_header(path.read_bytes())
@@ -104,6 +107,70 @@ def read_headers(path):
     if not headers:
         raise FileFormatError(f"{path}: must hold a header with CTYPE1, CRVAL1, ...; found none")
     return headers
+
+
+def header_of(hdus, index, name):
+    """Return a copy of the header of an HDU, or of its image if it is a FITS_LDAC list.
+
+    Parameters
+    ----------
+    hdus : `~astropy.io.fits.HDUList`
+        The open file.
+    index : int
+        Number of the HDU.
+    name : path-like
+        Name for messages.
+
+    Returns
+    -------
+    header : `~astropy.io.fits.Header`
+        The header.
+
+    Raises
+    ------
+    FileFormatError
+        If the header in a list is damaged.
+    """
+    if hdus[index].name == "LDAC_OBJECTS" and index and hdus[index - 1].name == "LDAC_IMHEAD":
+        return ldac_header(hdus, index, name)
+    return hdus[index].header.copy()
+
+
+def ldac_header(hdus, index, name, *, error=FileFormatError):
+    """Return the image header that a FITS_LDAC file carries as a table of one string.
+
+    Parameters
+    ----------
+    hdus : `~astropy.io.fits.HDUList`
+        The open file.
+    index : int
+        Number of the ``LDAC_OBJECTS``.
+    name : path-like
+        Name for messages.
+    error : type, optional
+        Subclass of `~wpdc_gwcs.exceptions.InputError` that is raised.
+
+    Returns
+    -------
+    header : `~astropy.io.fits.Header`
+        Header of the image from which the list was made.
+
+    Raises
+    ------
+    InputError
+        If there is no such header, or it is damaged.
+    """
+    if index == 0 or hdus[index - 1].name != "LDAC_IMHEAD":
+        raise error(f"{name}: LDAC_OBJECTS must follow LDAC_IMHEAD")
+    try:
+        text = np.asarray(hdus[index - 1].data).tobytes()
+    except READ_ERRORS as problem:
+        raise error(f"{name}: damaged LDAC_IMHEAD: {first_line(problem)}") from problem
+    # Cards of 80 bytes without line ends.
+    headers = clean_header(b"\n".join(text[i : i + 80] for i in range(0, len(text), 80)))
+    if not headers:
+        raise error(f"{name}: LDAC_IMHEAD must hold a header, is empty")
+    return headers[0]
 
 
 def find_extension(hdus, extension, path, *, error=FileFormatError):

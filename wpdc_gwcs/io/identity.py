@@ -11,6 +11,7 @@ from wpdc_gwcs.io.headers import header_text, positive_number
 __all__ = [
     "NOT_NAMES",
     "detector_name",
+    "detector_names",
     "distinct",
     "exposure_keys",
     "file_name",
@@ -123,13 +124,30 @@ def detector_name(headers):
     str
         Name of the detector, or `wpdc_gwcs.detector.UNNAMED`.
     """
+    return next(iter(detector_names(headers).values()), UNNAMED)
+
+
+def detector_names(headers):
+    """List all names that headers have for a detector.
+
+    Parameters
+    ----------
+    headers : list of `~astropy.io.fits.Header`
+        Header of the frame first, then that of its file.
+
+    Returns
+    -------
+    dict
+        Name by keyword, best first.  The name of an extension, ``EXTNAME``, may be of anything.
+    """
     # The primary header describes the whole camera; the header of the frame takes precedence.
+    found = {}
     for header in headers:
         for key in _DETECTOR_KEYS:
             text = header_text(header, key)
             if text.upper() not in (*NOT_NAMES, "LDAC_OBJECTS", "LDAC_IMHEAD"):
-                return text
-    return UNNAMED
+                found.setdefault(key, text)
+    return found
 
 
 def header_facts(headers):

@@ -11,7 +11,14 @@ from astropy.table import Table
 from wpdc_gwcs.catalogs import read_table_file
 from wpdc_gwcs.columns import listed
 from wpdc_gwcs.exceptions import FileFormatError
-from wpdc_gwcs.io.files import READ_ERRORS, as_utf8, atomic_path, file_kind, first_line
+from wpdc_gwcs.io.files import (
+    READ_ERRORS,
+    as_utf8,
+    atomic_path,
+    check_suffix,
+    file_kind,
+    first_line,
+)
 
 __all__ = ["read_matches", "read_table", "write_table"]
 
@@ -37,7 +44,7 @@ def write_table(table, path, *, overwrite=False):
     OutputExistsError
         If the file exists and may not be replaced.
     InputError
-        If the file cannot be written.
+        If the file cannot be written, or its suffix belongs to another format.
 
     Notes
     -----
@@ -54,6 +61,7 @@ def write_table(table, path, *, overwrite=False):
     >>> bool(read_table(path)["x"][0] == 0.1 + 0.2)  # to the last digit
     True
     """
+    check_suffix(path, "ecsv")
     plain = Table(table, copy=False)
     if (
         any(getattr(column, "ndim", 0) != 1 for column in plain.itercols())
