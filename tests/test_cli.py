@@ -426,7 +426,8 @@ def test_other_commands_refuse_in_one_line(results, capsys, arguments, status, m
 
 @pytest.mark.parametrize("form", ["fits", "cpdis", "tpv", "head", "sip", "tab", "stock"])
 def test_export(results, tmp_path, capsys, form):
-    out = tmp_path / f"out.{'asdf' if form == 'stock' else 'fits'}"
+    suffix = {"stock": "asdf", "head": "head"}.get(form, "fits")
+    out = tmp_path / f"out.{suffix}"
     command = ["export", str(results / "sim-01.wcs.asdf"), "--format", form, "--output", str(out)]
     assert run(command) == 0
     assert out.exists()
