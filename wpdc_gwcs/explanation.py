@@ -28,7 +28,13 @@ from wpdc_gwcs.calibration.start import (
     sky_of,
 )
 from wpdc_gwcs.calibration.story import tell_match, tell_sources
-from wpdc_gwcs.catalogs import Region, catalog_source, fill_motions, read_catalog
+from wpdc_gwcs.catalogs import (
+    Region,
+    catalog_source,
+    fill_motions,
+    read_catalog,
+    split_extension,
+)
 from wpdc_gwcs.columns import numbers_or_nan
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.detector import detector_label
@@ -43,6 +49,8 @@ __all__ = ["Explanation", "Stage", "explain_frame"]
 _FEW, _PLENTY = 8, 30
 # A larger relative error of the scale is an error of the header; a blind search finds smaller ones.
 _SCALE_OFF = 0.03
+# Trials: options, settings, factor of the scale.
+_FAINTER = "--min-snr 3 --max-roundness 1", {"min_snr": 3.0, "max_roundness": 1.0}, 1.0
 # Scales that are tried, relative to that of the header: headers often have that of another binning.
 _SCALES = (1.0, 0.5, 2.0)
 # Residuals this many times the errors are worth a word; stated errors are often half the true ones.
@@ -355,12 +363,18 @@ def _advise_on_match(story, stars, sources, error):
             f"{_FEW} sources are needed, {n} can be used: {more}solve it with the other detectors "
             "of its camera, or with a --solution"
         )
-    elif not _try_otherwise(story, stars, sources, _SCALES):
+    elif not _try(story, stars, sources, [_FAINTER, *_other_headers(story, _SCALES)]):
         story.advice.append(
             "neither a blind search, nor half or twice the scale, nor fainter stars match: check "
             "whether frame and catalog show the same sky, and whether the scale is right "
             "(--pixel-scale)"
         )
+        path, extension = split_extension(story.frame.source)
+        if extension is not None:
+            story.advice.append(
+                "solve it with the other detectors of its exposure, from which it may be matched: "
+                f"wpdc calibrate {shlex.quote(str(path))} ..."
+            )
 
 
 def _advise_on_header(story, stars, sources, found):
@@ -371,8 +385,8 @@ def _advise_on_header(story, stars, sources, found):
         f"{found['shift'][1]:.0f} px, turned by {found['rotation']:.2f} deg, and a scale of "
         f"{_scale_of(story.frame) * scale:.5g} arcsec / px"
     )
-    factors = (scale,) if abs(scale - 1) > _SCALE_OFF else (1.0,)
-    if not _try_otherwise(story, stars, sources, factors):
+    factors = [scale if abs(scale - 1) > _SCALE_OFF else 1.0]
+    if not _try(story, stars, sources, _other_headers(story, factors)):
         story.advice.append(
             f"{off}: if that is right, correct the header, or give a better one (--wcs HEADER)"
         )
@@ -383,15 +397,21 @@ def _scale_of(frame):
     return linear_wcs(frame.wcs, header_reference_point(frame)).scale * 3600
 
 
-def _try_otherwise(story, stars, sources, factors):
-    """Advise on the options that would match the frame; return whether there are any."""
-    name, settings = shlex.quote(story.frame.source), story.settings
-    trials = [("--min-snr 3 --max-roundness 1", {"min_snr": 3.0, "max_roundness": 1.0}, 1.0)]
+def _other_headers(story, factors):
+    """List trials for other scales of the header, each also with a blind search."""
+    trials = []
     for factor in factors:
+        if factor == 1:
+            trials.append(("--blind", {"blind": True}, factor))
+            continue
         scale = f"--pixel-scale {_scale_of(story.frame) * factor:.5g}"
-        options = scale if factor != 1 else ""
-        trials += [(scale, {}, factor)] if factor != 1 else []
-        trials += [(f"{options} --blind".strip(), {"blind": True}, factor)]
+        trials += [(scale, {}, factor), (f"{scale} --blind", {"blind": True}, factor)]
+    return trials
+
+
+def _try(story, stars, sources, trials):
+    """Advise on the first options that match the frame; return whether there are any."""
+    name, settings = shlex.quote(story.frame.source), story.settings
     for options, changes, factor in trials:
         other = replace(settings, **changes)
         if other == settings and factor == 1:
