@@ -67,7 +67,9 @@ def test_a_turned_frame_is_found_out_by_a_blind_search(sky, angle):
     ("scale", "angle", "options"),
     [(2.0, 0.0, ""), (0.5, 40.0, " --blind"), (1.08, 0.0, ""), (1.08, 30.0, " --blind")],
 )
-def test_a_wrong_scale_is_found_out(sky, scale, angle, options):
+def test_a_wrong_scale_is_found_out(scale, angle, options):
+    # Few stars, so that the searches that fail take little time.
+    sky = simulate(1, image_shape=(512, 512), density=15.0, distortion=5.0, seed=3)
     frame = sky.exposures[0].frame()
     true = 3600 * np.sqrt(abs(np.linalg.det(frame.wcs.wcs.cd)))
     told = explain_frame(changed(frame, angle, scale), sky.reference)
@@ -210,7 +212,7 @@ def test_advice_is_that_of_the_case(sky, what):
         for name in ("CD1_1", "CD1_2", "CD2_1", "CD2_2"):
             header[name] *= 1.3
         frame = replace(frame, wcs=WCS(header))
-        expected = r"a match was found .*a scale of 0\.\d+ arcsec / px: .*--pixel-scale 0\.\d+"
+        expected = r"it matches with --pixel-scale 0\.\d+ \(\d+ pairs"
     elif what == "pointing":
         header["CRPIX1"] += 490.0
         frame = replace(frame, wcs=WCS(header))

@@ -409,8 +409,11 @@ def _other_headers(story, factors):
     return trials
 
 
-def _try(story, stars, sources, trials):
-    """Advise on the first options that match the frame; return whether there are any."""
+def _try(story, stars, sources, trials, *, follow=True):
+    """Advise on the first options that match the frame; return whether there are any.
+
+    If a match is refused for its scale, this scale is tried instead of the other options.
+    """
     name, settings = shlex.quote(story.frame.source), story.settings
     for options, changes, factor in trials:
         other = replace(settings, **changes)
@@ -418,6 +421,12 @@ def _try(story, stars, sources, trials):
             continue
         try:
             match = match_frame(_scaled(story.frame, factor), stars, other, sources=sources)
+        except MatchError as error:
+            scale = 1.0 if error.found is None else error.found["scale"]
+            if follow and abs(scale - 1) > _SCALE_OFF:
+                better = _other_headers(story, [factor * scale])
+                return _try(story, stars, sources, better, follow=False)
+            continue
         except WPDCError:
             continue
         found = match.diagnostics
