@@ -337,22 +337,30 @@ def spoil_few(seed):
 
 
 def report_few_impossible(n, first):
-    accepted, seconds = 0, []
-    for seed in range(first, first + n):
-        field, sources, catalog, about = spoil_few(seed)
-        began = time.process_time()
-        try:
-            _, found = match_sources(sources, catalog, field.header, image_shape=field.shape)
-        except MatchError:
-            continue
-        finally:
-            seconds.append(time.process_time() - began)
-        accepted += 1
-        print(f"  accepted: {about}: {found.to_dict()}")
-    print(
-        f"few-impossible: {n} cases, {n - accepted} refused; "
-        f"{np.mean(seconds):.2f} s each (processor), longest {np.max(seconds):.1f}"
-    )
+    for blind in (False, True):
+        accepted, seconds = 0, []
+        for seed in range(first, first + n):
+            field, sources, catalog, about = spoil_few(seed)
+            if blind and ("mirror" in about or "half a turn" in about):
+                # A blind search finds these.
+                continue
+            shape = field.shape
+            began = time.process_time()
+            try:
+                _, found = match_sources(
+                    sources, catalog, field.header, image_shape=shape, blind=blind
+                )
+            except MatchError:
+                continue
+            finally:
+                seconds.append(time.process_time() - began)
+            accepted += 1
+            print(f"  accepted: {about}: {found.to_dict()}")
+        print(
+            f"few-impossible{' (blind)' if blind else ''}: {len(seconds)} cases, "
+            f"{len(seconds) - accepted} refused; "
+            f"{np.mean(seconds):.2f} s each (processor), longest {np.max(seconds):.1f}"
+        )
 
 
 def report_refusals(n):
@@ -385,7 +393,10 @@ def report_refusals(n):
 
 
 def report_blind(n, first, max_stars):
-    kinds = ("mirrored", "90 deg", "180 deg", "270 deg mirrored", "scale 5 %", "1/4 frame")
+    kinds = (
+        "mirrored", "90 deg", "180 deg", "270 deg mirrored", "scale 5 %", "1/4 frame", "any angle",
+        "any angle mirrored",
+    )  # fmt: skip
     refused, solved, wrong, seconds = 0, 0, 0, []
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     flip = np.diag([-1.0, 1.0])
@@ -397,7 +408,11 @@ def report_blind(n, first, max_stars):
             continue
         kind = kinds[done % len(kinds)]
         done += 1
+        angle = rng.uniform(0, 2 * np.pi)
+        c, s = np.cos(angle), np.sin(angle)
         matrix = {
+            "any angle": np.array([[c, -s], [s, c]]),
+            "any angle mirrored": np.array([[c, -s], [s, c]]) @ flip,
             "mirrored": flip,
             "90 deg": turn,
             "180 deg": turn @ turn,
@@ -407,10 +422,9 @@ def report_blind(n, first, max_stars):
         center = 0.5 * (np.array(case["image_shape"][::-1]) - 1)
         points = (np.column_stack([case["xr"], case["yr"]]) - center) @ matrix.T + center
         if kind == "1/4 frame":
-            angle = rng.uniform(0, 2 * np.pi)
             # on top of the pointing error that every case has
             length = max(0.25 * max(case["image_shape"]) - 30 * ARCSEC, 0)
-            points += length * np.array([np.cos(angle), np.sin(angle)])
+            points += length * np.array([c, s])
         case |= {"xr": points[:, 0], "yr": points[:, 1]}
         refused += run_case(case)[1] is None
         elapsed, pairs, result = run_case(case, blind=True)

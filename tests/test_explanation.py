@@ -27,10 +27,10 @@ def solved(sky):
     return calibrate(sky.exposures[0].frame(), sky.reference)
 
 
-def turned(frame, degrees):
+def changed(frame, degrees=0.0, scale=1.0):
     wcs = frame.wcs.deepcopy()
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    wcs.wcs.cd = wcs.wcs.cd @ [[c, -s], [s, c]]
+    wcs.wcs.cd = wcs.wcs.cd @ [[c, -s], [s, c]] * scale
     return replace(frame, wcs=wcs)
 
 
@@ -48,16 +48,35 @@ def test_a_frame_that_is_solved(sky, solved):
     assert [axes.has_data() for axes in figure.axes] == [True] * 4
 
 
-def test_a_turned_frame_is_found_out_by_a_blind_search(sky):
-    frame = turned(sky.exposures[0].frame(), 90.0)
+@pytest.mark.parametrize("angle", [8.0, 90.0, 157.0])
+def test_a_turned_frame_is_found_out_by_a_blind_search(sky, angle):
+    frame = changed(sky.exposures[0].frame(), angle)
     told = explain_frame(frame, sky.reference)
     assert told.status == "failed"
     assert [s.name for s in told.stages if not s.went_well] == ["match"]
     advice = " ".join(told.advice)
     assert "it matches with --blind" in advice
-    assert "90.0 deg" in advice
+    assert f"-{angle:.1f} deg" in advice
+    # The advice is right.
+    assert explain_frame(frame, sky.reference, Settings(blind=True)).status == "solved"
     figure = draw_explanation(told)
     assert "no solution: ends with the match" in figure.axes[3].texts[0].get_text()
+
+
+@pytest.mark.parametrize(
+    ("scale", "angle", "options"),
+    [(2.0, 0.0, ""), (0.5, 40.0, " --blind"), (1.08, 0.0, ""), (1.08, 30.0, " --blind")],
+)
+def test_a_wrong_scale_is_found_out(scale, angle, options):
+    # Few stars, so that the searches that fail take little time.
+    sky = simulate(1, image_shape=(512, 512), density=15.0, distortion=5.0, seed=3)
+    frame = sky.exposures[0].frame()
+    true = 3600 * np.sqrt(abs(np.linalg.det(frame.wcs.wcs.cd)))
+    told = explain_frame(changed(frame, angle, scale), sky.reference)
+    assert told.status == "failed"
+    found = re.search(r"it matches with --pixel-scale (\S+)(.*?) \(", " ".join(told.advice))
+    assert float(found[1]) == pytest.approx(true, rel=0.005)
+    assert found[2] == options
 
 
 def test_a_catalog_of_another_sky(sky):
@@ -193,7 +212,7 @@ def test_advice_is_that_of_the_case(sky, what):
         for name in ("CD1_1", "CD1_2", "CD2_1", "CD2_2"):
             header[name] *= 1.3
         frame = replace(frame, wcs=WCS(header))
-        expected = r"a match was found .*a scale of 0\.\d+ arcsec / px: .*--pixel-scale 0\.\d+"
+        expected = r"it matches with --pixel-scale 0\.\d+ \(\d+ pairs"
     elif what == "pointing":
         header["CRPIX1"] += 490.0
         frame = replace(frame, wcs=WCS(header))

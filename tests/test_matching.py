@@ -310,6 +310,24 @@ def test_blind_finds_turned_frames(name):
     assert np.median(np.hypot(x - field["xr"][j], y - field["yr"][j])) < 0.2
 
 
+@pytest.mark.parametrize("shape", [(2048, 2048), (2048, 600)])
+@pytest.mark.parametrize(("angle", "parity"), [(8.0, 1), (22.0, -1), (67.0, 1), (157.0, -1)])
+def test_blind_finds_any_rotation(shape, angle, parity):
+    field = make_field(16, shape=shape, distortion=10.0, rotation=0.0)
+    c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    turned = turn(field, np.array([[c, -s], [s, c]]) @ np.diag([parity, 1]))
+    with pytest.raises(MatchError, match="blind=True"):
+        run(turned)
+    i, j, found = run(turned, blind=True)
+    assert_right(field, i, j)
+    assert found.parity == parity
+    assert found.rotation == pytest.approx(angle, abs=0.5)
+    # The evidence is that of the frame, whatever the header says.
+    _, _, upright = run(field)
+    assert found.completeness == pytest.approx(upright.completeness, abs=0.01)
+    assert len(found.areas) == len(upright.areas)
+
+
 def test_a_wider_search_is_suggested_only_where_it_can_help():
     field = turn(make_field(17, scale=1.0), np.eye(2) * 0.8)
     for blind in (False, True):

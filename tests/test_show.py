@@ -264,6 +264,32 @@ def test_a_list_of_sources(folder, sky):
     assert "columns used: x, y, x_err, y_err, flux, snr" in told
 
 
+SEXTRACTOR = """\
+#   1 NUMBER          Running object number
+#   2 XWIN_IMAGE      Windowed position estimate along x    [pixel]
+#   3 YWIN_IMAGE      Windowed position estimate along y    [pixel]
+1 100.5 200.5
+2 300.5 250.5
+"""
+DAOPHOT = """\
+ NL    NX    NY  LOWBAD HIGHBAD  THRESH     AP1  PH/ADU  RNOISE    FRAD
+  1  2048  4096   100.0 30000.0   10.00    3.00    2.00    3.00    4.00
+
+     1   100.50   200.50   15.000   0.010
+     2   300.50   250.50   16.000   0.010
+"""
+
+
+@pytest.mark.parametrize("text", [SEXTRACTOR, DAOPHOT])
+def test_lists_of_other_programs(tmp_path, text):
+    (tmp_path / "a.cat").write_text(text)
+    found = contents_of(str(tmp_path / "a.cat"))
+    lines = dict(found.lines)
+    assert "of 2 sources" in lines["sources"]
+    assert lines["first pixel"] == "1"
+    assert found.draw().axes[0].has_data()
+
+
 def test_weight_maps_and_masks_are_no_images_of_stars(folder, tmp_path):
     header = fits.getheader(folder / "sim-01.fits")
     weight = np.ones((512, 512), np.float32)

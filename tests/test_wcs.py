@@ -634,7 +634,7 @@ def test_stock_forms_of_a_camera_are_made_once_for_each_detector(monkeypatch):
     """The frames of a camera come exposure by exposure, each with its own attitude."""
     made, inverse = [], stock_module._stock_inverse
     monkeypatch.setattr(stock_module, "_stock_inverse", lambda *a: made.append(a) or inverse(*a))
-    stock_module._pickled_model.cache_clear()
+    stock_module._kept.clear()
     for roll in (0.0, 0.3):
         for seed in (3, 4, 5):
             wcs = camera_wcs(roll=roll, seed=seed, shape=(300, 200), corner=5.0)
@@ -643,6 +643,12 @@ def test_stock_forms_of_a_camera_are_made_once_for_each_detector(monkeypatch):
             back = stock.invert(*wcs(10.0, 250.0), with_bounding_box=False)
             assert_allclose(back, (10.0, 250.0), rtol=0, atol=1e-4)
     assert len(made) == 3
+    # Only the detectors used last are kept.
+    monkeypatch.setattr(stock_module, "_KEPT", 2)
+    for seed, n in ((5, 3), (4, 3), (3, 4)):
+        to_stock_wcs(camera_wcs(roll=0.1, seed=seed, shape=(300, 200), corner=5.0))
+        assert len(made) == n
+    assert len(stock_module._kept) == 2
 
 
 # --- whole images

@@ -172,8 +172,9 @@ class MatchError(FrameFailure):
     message : str
         What is wrong.
     found : dict, optional
-        For a match that is farther from the header than allowed: ``shift`` (px), ``rotation``
-        (deg) and ``scale`` (factor) relative to the header.
+        For a match that is farther from the header than allowed: ``n_pairs``; ``shift`` of the
+        center (px), ``rotation`` (deg), ``scale`` (factor) and ``parity`` (1, or -1 if mirrored)
+        relative to the header.
 
     Examples
     --------

@@ -21,14 +21,27 @@ from wpdc_gwcs.calibration.matched import (
 )
 from wpdc_gwcs.calibration.measure import measure_sources, rules_of
 from wpdc_gwcs.calibration.settings import Settings
-from wpdc_gwcs.calibration.start import header_reference_point, linear_wcs, sky_of
+from wpdc_gwcs.calibration.start import (
+    detector_center,
+    header_reference_point,
+    linear_wcs,
+    sky_of,
+)
 from wpdc_gwcs.calibration.story import tell_match, tell_sources
-from wpdc_gwcs.catalogs import Region, catalog_source, fill_motions, read_catalog
+from wpdc_gwcs.catalogs import (
+    Region,
+    catalog_source,
+    fill_motions,
+    read_catalog,
+    split_extension,
+)
 from wpdc_gwcs.columns import numbers_or_nan
 from wpdc_gwcs.counts import counted
 from wpdc_gwcs.detector import detector_label
 from wpdc_gwcs.exceptions import MatchError, WPDCError
 from wpdc_gwcs.extras import PLOT, missing
+from wpdc_gwcs.io.tan import TanHeader
+from wpdc_gwcs.models import PVPolynomial
 
 __all__ = ["Explanation", "Stage", "explain_frame"]
 
@@ -36,6 +49,10 @@ __all__ = ["Explanation", "Stage", "explain_frame"]
 _FEW, _PLENTY = 8, 30
 # A larger relative error of the scale is an error of the header; a blind search finds smaller ones.
 _SCALE_OFF = 0.03
+# Trials: options, settings, factor of the scale.
+_FAINTER = "--min-snr 3 --max-roundness 1", {"min_snr": 3.0, "max_roundness": 1.0}, 1.0
+# Scales that are tried, relative to that of the header: headers often have that of another binning.
+_SCALES = (1.0, 0.5, 2.0)
 # Residuals this many times the errors are worth a word; stated errors are often half the true ones.
 _OVER_ERRORS = 4
 
@@ -346,51 +363,88 @@ def _advise_on_match(story, stars, sources, error):
             f"{_FEW} sources are needed, {n} can be used: {more}solve it with the other detectors "
             "of its camera, or with a --solution"
         )
-    else:
-        _try_otherwise(story, stars, sources)
+    elif not _try(story, stars, sources, [_FAINTER, *_other_headers(story, _SCALES)]):
+        story.advice.append(
+            "neither a blind search, nor half or twice the scale, nor fainter stars match: check "
+            "whether frame and catalog show the same sky, and whether the scale is right "
+            "(--pixel-scale)"
+        )
+        path, extension = split_extension(story.frame.source)
+        if extension is not None:
+            story.advice.append(
+                "solve it with the other detectors of its exposure, from which it may be matched: "
+                f"wpdc calibrate {shlex.quote(str(path))} ..."
+            )
 
 
 def _advise_on_header(story, stars, sources, found):
-    """Suggest a correction of the header for a match that is too far from it."""
-    frame = story.frame
-    scale = found["scale"] * linear_wcs(frame.wcs, header_reference_point(frame)).scale * 3600
+    """Suggest what to do about a match that is too far from the header."""
+    scale = found["scale"]
     off = (
         f"a match was found with the header off by {found['shift'][0]:.0f}, "
         f"{found['shift'][1]:.0f} px, turned by {found['rotation']:.2f} deg, and a scale of "
-        f"{scale:.5g} arcsec / px"
+        f"{_scale_of(story.frame) * scale:.5g} arcsec / px"
     )
-    story.advice.append(
-        f"{off}: if that is right, --pixel-scale {scale:.5g}"
-        if abs(found["scale"] - 1) > _SCALE_OFF
-        else f"{off}: if that is right, correct the header, or give a better one (--wcs HEADER)"
-    )
-    _try_otherwise(story, stars, sources, last=False)
+    factors = [scale if abs(scale - 1) > _SCALE_OFF else 1.0]
+    if not _try(story, stars, sources, _other_headers(story, factors)):
+        story.advice.append(
+            f"{off}: if that is right, correct the header, or give a better one (--wcs HEADER)"
+        )
 
 
-def _try_otherwise(story, stars, sources, *, last=True):
-    """Find out which other option would match the frame."""
+def _scale_of(frame):
+    """Scale of the header, arcsec / px."""
+    return linear_wcs(frame.wcs, header_reference_point(frame)).scale * 3600
+
+
+def _other_headers(story, factors):
+    """List trials for other scales of the header, each also with a blind search."""
+    trials = []
+    for factor in factors:
+        if factor == 1:
+            trials.append(("--blind", {"blind": True}, factor))
+            continue
+        scale = f"--pixel-scale {_scale_of(story.frame) * factor:.5g}"
+        trials += [(scale, {}, factor), (f"{scale} --blind", {"blind": True}, factor)]
+    return trials
+
+
+def _try(story, stars, sources, trials, *, follow=True):
+    """Advise on the first options that match the frame; return whether there are any.
+
+    If a match is refused for its scale, this scale is tried instead of the other options.
+    """
     name, settings = shlex.quote(story.frame.source), story.settings
-    trials = {
-        "--min-snr 3 --max-roundness 1": replace(settings, min_snr=3.0, max_roundness=1.0),
-        "--blind": replace(settings, blind=True),
-    }
-    for option, other in trials.items():
-        if other == settings:
+    for options, changes, factor in trials:
+        other = replace(settings, **changes)
+        if other == settings and factor == 1:
             continue
         try:
-            match = match_frame(story.frame, stars, other, sources=sources)
+            match = match_frame(_scaled(story.frame, factor), stars, other, sources=sources)
+        except MatchError as error:
+            scale = 1.0 if error.found is None else error.found["scale"]
+            if follow and abs(scale - 1) > _SCALE_OFF:
+                better = _other_headers(story, [factor * scale])
+                return _try(story, stars, sources, better, follow=False)
+            continue
         except WPDCError:
             continue
         found = match.diagnostics
         story.advice.append(
-            f"it matches with {option} ({counted(found.n_pairs, 'pair')}; the header is off by "
+            f"it matches with {options} ({counted(found.n_pairs, 'pair')}; the header is off by "
             f"{np.hypot(*found.shift):.0f} px and {found.rotation:.1f} deg"
-            f"{', mirrored' if found.parity < 0 else ''}): wpdc calibrate {name} {option} ..."
+            f"{', mirrored' if found.parity < 0 else ''}): wpdc calibrate {name} {options} ..."
         )
-        return
-    if last:
-        story.advice.append(
-            "neither a blind search nor fainter stars match: check whether frame and catalog show "
-            "the same sky, whether the scale is right (--pixel-scale), and the position angle: "
-            "angles other than multiples of 90 deg are not searched (--wcs HEADER)"
-        )
+        return True
+    return False
+
+
+def _scaled(frame, factor):
+    """Return a frame whose header has another scale, without its distortion."""
+    if factor == 1:
+        return frame
+    start = linear_wcs(frame.wcs, detector_center(frame.image_shape))
+    scaled = TanHeader(
+        start.crpix, factor * start.cd, start.crval, PVPolynomial(1), frame.image_shape
+    )
+    return replace(frame, wcs=scaled.to_wcs())

@@ -421,7 +421,8 @@ class Calibration(Described, InMemory):
         if len(tables) < 2:
             return tables[0] if tables else None
         table, other = tables
-        dx, dy = other(*np.meshgrid(table.x_grid, table.y_grid))
+        # A copy, because a table that is evaluated keeps its spline, which is 16 times its size.
+        dx, dy = other.copy()(*np.meshgrid(table.x_grid, table.y_grid))
         return LookupTable(
             table.x_grid, table.y_grid, table.dx + dx, table.dy + dy, method=table.method
         )

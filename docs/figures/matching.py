@@ -96,7 +96,7 @@ def frame_axes(panel, shape, margin=0.0):
     """Axes of the detector in pixels, in equal scale."""
     ny, nx = shape
     panel.set(xlim=(-margin, nx + margin), ylim=(-margin, ny + margin), aspect="equal")
-    panel.set(xlabel="x (px)", ylabel="y (px)")
+    panel.set(xlabel="x [px]", ylabel="y [px]")
 
 
 def draw_preparation(stages):
@@ -112,7 +112,7 @@ def draw_preparation(stages):
             stages.all_x[mask], stages.all_y[mask], s=40, marker=marker, edgecolors=color,
             color=color if marker == "x" else None, label=f"{text}", **face,
         )  # fmt: skip
-    left.set(xlim=(700, 1300), ylim=(700, 1300), xlabel="x (px)", ylabel="y (px)")
+    left.set(xlim=(700, 1300), ylim=(700, 1300), xlabel="x [px]", ylabel="y [px]")
     left.set_title(f"{stages.use.sum()} of {len(stages.use)} sources (a part of the frame)")
     left.legend(loc="upper right", framealpha=0.95)
     limits = stages.problem.limits
@@ -179,16 +179,16 @@ def draw_features(stages):
             panel.plot([x, other[0]], [y, other[1]], "-", lw=1, color=color)
         panel.plot(*stars.points[neighbor[0]].T, "o", ms=6, color=color)
         panel.plot(x, y, "*", ms=17, color=color, mec="k")
-        panel.set(xlim=(x - 100, x + 100), ylim=(y - 100, y + 100), aspect="equal", xlabel="x (px)")
+        panel.set(xlim=(x - 100, x + 100), ylim=(y - 100, y + 100), aspect="equal", xlabel="x [px]")
         panel.set_title(f"{title}, {n} neighbors")
-    panels[0, 0].set_ylabel("y (px)")
+    panels[0, 0].set_ylabel("y [px]")
     panel = panels[1, 0]
     for (log_d, angle), (title, _, _, color), marker in zip(
         patterns[:2], lists[:2], "os", strict=True
     ):
         panel.plot(np.rad2deg(angle), np.exp(log_d), marker, ms=8, mfc="none", mew=2, color=color,
                    label=title)  # fmt: skip
-    panel.set(xlabel=r"$\theta$ (deg)", ylabel="d (px, log scale)", yscale="log", ylim=(4, 130))
+    panel.set(xlabel=r"$\theta$ [deg]", ylabel="d [px, log scale]", yscale="log", ylim=(4, 130))
     panel.set_yticks([5, 10, 20, 50, 100], ["5", "10", "20", "50", "100"], minor=False)
     panel.set_yticks([], minor=True)
     panel.set_title("patterns of both")
@@ -211,7 +211,7 @@ def draw_features(stages):
         limit = problem.limits.max_scale + problem.limits.gradient
         turn = problem.limits.max_rotation + np.rad2deg(problem.limits.gradient)
         panel.set(xlim=(-turn, turn), ylim=(-limit, limit))
-        panel.set(xlabel=r"difference of $\theta$ (deg)", ylabel="difference of log d")
+        panel.set(xlabel=r"difference of $\theta$ [deg]", ylabel="difference of log d")
         panel.set_title(
             f"{title}: {h.count[candidate]:.0f} agree\n({h.expected[candidate]:.1g} by chance)"
         )
@@ -273,7 +273,7 @@ def draw_clipping(stages):
                   label=f"{mask.sum()} {text}")  # fmt: skip
     left.add_patch(Circle((0, 0), limit, fill=False, color="k", lw=2))
     left.set(xlim=(-6 * limit, 6 * limit), ylim=(-6 * limit, 6 * limit), aspect="equal")
-    left.set(xlabel="residual in x (px)", ylabel="residual in y (px)")
+    left.set(xlabel="residual in x [px]", ylabel="residual in y [px]")
     left.set_title(f"clipped outside of {limit:.2g} px")
     left.legend(loc="upper right")
     length = np.hypot(*residual.T)
@@ -281,7 +281,7 @@ def draw_clipping(stages):
     right.hist([length[good], length[~good]], bins=bins, stacked=True, color=[BLUE, ORANGE])
     right.axvline(np.median(length), color=GREEN, lw=2, ls="--", label="median")
     right.axvline(limit, color="k", lw=2, label="5 robust standard deviations")
-    right.set(xscale="log", xlabel="residual (px)", ylabel="pairs")
+    right.set(xscale="log", xlabel="residual [px]", ylabel="pairs")
     right.set_title(f"order {fit.mapping.order}, scatter {fit.scatter:.2g} px, "
                     f"{fit.used.sum()} of {len(i)} used")  # fmt: skip
     right.legend()
@@ -337,7 +337,7 @@ def draw_growth(stages):
                    label=f"grown: {len(old[0])}")  # fmt: skip
     panels[5].hist(np.hypot(*residual.T), bins=bins, histtype="step", lw=2, color=BLUE,
                    label=f"fine: {len(fine[0])}")  # fmt: skip
-    panels[5].set(xlabel="residual (px)", ylabel="pairs", title="the fine step")
+    panels[5].set(xlabel="residual [px]", ylabel="pairs", title="the fine step")
     panels[5].set_box_aspect(1)
     panels[5].legend()
     return figure
@@ -366,7 +366,7 @@ def draw_evidence(stages):
     panels[1].axhline(d.expected_by_chance, color="k", ls="--", lw=1.5, label="chance")
     panels[1].set(xscale="log", yscale="symlog", ylim=(0, 2 * d.n_pairs))
     panels[1].set_box_aspect(1)
-    panels[1].set(xlabel="sources shifted by (px)", ylabel="pairs")
+    panels[1].set(xlabel="shift of the sources [px]", ylabel="pairs")
     panels[1].set_title(f"{d.n_pairs} against {d.expected_by_chance:.1f}: {d.significance:.0f} σ")
     panels[1].legend(loc="lower left", bbox_to_anchor=(0, 0.3))
     share = [a.n_pairs / a.expected for a in d.areas]

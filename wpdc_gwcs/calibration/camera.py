@@ -185,13 +185,11 @@ def solve_camera(group, settings, *, holdout=None, solution=None, update=False):
             choice = {name: info.choice for name, info in result.table_infos.items()}
         if attempt + 1 == _MAX_REMATCH:
             break
-        found = [
-            None if fit.reason is not None else _as_calibration(frame, fit, result)
-            for frame, fit in zip(group, result.exposures, strict=True)
-        ]
         fresh = [
-            frame.pairs if calibration is None else _rematch(frame, old, calibration, fit)
-            for frame, old, calibration, fit in zip(group, pairs, found, result.exposures)
+            frame.pairs
+            if fit.reason is not None
+            else _rematch(frame, old, _as_calibration(frame, fit, result), fit)
+            for frame, old, fit in zip(group, pairs, result.exposures, strict=True)
         ]
         moved = sum(
             _n_changed(old, new, fit.used)

@@ -1,5 +1,7 @@
 """The summary of a run: one row per frame, solved or not."""
 
+from dataclasses import replace
+
 import numpy as np
 from astropy.table import QTable
 
@@ -67,7 +69,8 @@ def summary_row(frame, result, calibration, failure, settings):
     row |= quality_of(frame, result.sources, settings, counts=counts) | {"epoch": epoch}
     offset, rotation = np.nan, np.nan
     if calibration is not None:
-        offset, rotation = header_error(frame.wcs, calibration)
+        # A copy, because a calibration keeps the WCS that it makes, which is larger than the rest.
+        offset, rotation = header_error(frame.wcs, replace(calibration))
     return row | {"header_offset": offset, "header_rotation": rotation}
 
 

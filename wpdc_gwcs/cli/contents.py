@@ -166,6 +166,9 @@ def _of_text(file, path):
     if any(_CARD.match(card.image) for header in clean_header(start) for card in header.cards):
         return _of_result(file)
     is_page = _PAGE.match(start)
+    sources = _of_foreign_list(path)
+    if sources is not None:
+        return sources
     table = _table_or_none(path)
     if table is not None:
         try:
@@ -175,6 +178,23 @@ def _of_text(file, path):
                 return _of_any_table(table)
     what = "an HTML page; open it in a browser" if is_page else "a text without columns"
     raise FileFormatError(f"{path}: must be FITS, ASDF, a header or a table, is {what}")
+
+
+def _of_foreign_list(path):
+    """Contents of a list of sources by SExtractor, DAOPHOT or photutils, or `None`."""
+    from wpdc_gwcs.io.sources import read_source_table, source_origin, standardize_sources
+
+    try:
+        table, texts = read_source_table(path)
+    except FrameError:
+        return None
+    if {"x", "y"} <= set(table.colnames) and not any("DAOPHOT" in text for text in texts):
+        return None
+    origin = source_origin(table.colnames, texts=texts)
+    found = _of_sources(standardize_sources(table, name=str(path), origin=origin))
+    first = "not known, taken as 0 (--origin)" if origin is None else str(origin)
+    found.lines.append(("first pixel", first))
+    return found
 
 
 def _table_or_none(path):
@@ -204,24 +224,31 @@ def _of_any_table(table):
 
 def _of_table(path, table):
     """Lines about a table: a summary, matches, sources, or a catalog."""
-    from wpdc_gwcs import pictures
     from wpdc_gwcs.catalogs import read_catalog
-    from wpdc_gwcs.columns import numbers_or_nan
-    from wpdc_gwcs.selection import judge_sources, left_out
+    from wpdc_gwcs.pictures import draw_summary
 
     names = set(table.colnames)
     if {"frame", "status", "reason"} <= names:
-        return Contents(_of_summary(table), lambda: pictures.draw_summary(table))
+        return Contents(_of_summary(table), lambda: draw_summary(table))
     if {"x", "y", "dx", "dy", "used"} <= names:
         return _of_matches(table)
     if {"x", "y"} <= names:
-        lines = [("sources", left_out(judge_sources(table)) + _BY_DEFAULT)]
-        snr = numbers_or_nan(table, "snr")
-        if np.isfinite(snr).any():
-            lines.append(("S/N", f"{np.nanmin(snr):.1f} to {np.nanmax(snr):.0f}"))
-        lines.append(("columns", ", ".join(table.colnames)))
-        return Contents(lines, lambda: pictures.draw_sources(table))
+        return _of_sources(table)
     return _of_catalog(read_catalog(path))
+
+
+def _of_sources(table):
+    """Lines about a list of sources with columns x and y."""
+    from wpdc_gwcs.columns import numbers_or_nan
+    from wpdc_gwcs.pictures import draw_sources
+    from wpdc_gwcs.selection import judge_sources, left_out
+
+    lines = [("sources", left_out(judge_sources(table)) + _BY_DEFAULT)]
+    snr = numbers_or_nan(table, "snr")
+    if np.isfinite(snr).any():
+        lines.append(("S/N", f"{np.nanmin(snr):.1f} to {np.nanmax(snr):.0f}"))
+    lines.append(("columns", ", ".join(table.colnames)))
+    return Contents(lines, lambda: draw_sources(table))
 
 
 def _of_catalog(stars):

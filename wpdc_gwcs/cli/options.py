@@ -155,7 +155,7 @@ MinSNR = Annotated[
 Blind = Annotated[
     bool,
     typer.Option(
-        "--blind", help="Also try flips, 90 deg rotations, scale +-5 %, pointing +-1/4 frame."
+        "--blind", help="Also try flips, all rotations, scale +-5 %, pointing +-1/4 frame."
     ),
 ]
 

@@ -62,14 +62,10 @@ def _form(obj, n_nodes, version):
     middle = description(obj).crval[0]
     ra = middle + (ra - middle + 180.0) % 360.0 - 180.0
     values = np.stack([ra, dec], axis=-1)
-    column = fits.Column(
-        "COORDS",
-        f"{values.size}D",
-        dim=f"(2,{n_nodes},{n_nodes})",
-        unit="deg",
-        array=values[np.newaxis],
-    )
-    table = fits.BinTableHDU.from_columns([column], name=TAB_NAME, ver=version)
+    # In the byte order of FITS, because astropy takes a second to change that of a large cell.
+    cell = np.array([(values,)], dtype=[("COORDS", ">f8", values.shape)])
+    table = fits.BinTableHDU(cell.view(fits.FITS_rec), name=TAB_NAME, ver=version)
+    table.columns["COORDS"].unit = "deg"
     header = fits.Header()
     header["WCSAXES"] = (2, "number of axes")
     header["CTYPE1"] = ("RA---TAB", "right ascension, table")

@@ -144,7 +144,9 @@ def fit_tpv(obj, degree=None):
     # Radial terms cannot be moved to another center.
     if pv.radial or (left is not None and left <= max(_NEARLY * worst, _ENOUGH_PX)):
         return plain
-    cd, crpix, matrix, offset = nearer_linear_part(pv, plain.cd, plain.crpix, image_shape_of(obj))
+    cd, crpix, matrix, offset = nearer_linear_part(
+        pv.as_function(), plain.cd, plain.crpix, image_shape_of(obj)
+    )
     pixels, _ = sample_plane(obj)
     u = cd @ (pixels - crpix[:, np.newaxis])
     values = np.array(pv(*(matrix @ u + offset[:, np.newaxis])))

@@ -49,8 +49,9 @@ The stages:
 If the position of a frame is known to within a few star distances (from the other detectors of a
 camera), `match_nearby` needs no patterns and only as many stars as can prove the match.
 
-A blind search does all this for the eight orientations of the axes of the frame, with wider limits
-for pointing and scale.
+A blind search does all this for sixteen orientations, the mirrored ones included, and with wider
+limits for pointing and scale.  Patterns are compared over all rotations in between, so any rotation
+is found, and accepted if the pairs prove it by their number.
 """
 
 from wpdc_gwcs.matching._again import pair_again

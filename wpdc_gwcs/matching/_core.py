@@ -154,10 +154,10 @@ def _match_from_start(problem, start, clock):
     pairs, _ = pair(mapped, radius, problem.limit[part], problem.stars)
     clock.lap("start")
     pairs = part[pairs[0]], pairs[1]
-    found, attempts = judge_pairs(problem, np.eye(2), pairs, Attempts(), clock)
+    found, attempts = judge_pairs(problem, pairs, Attempts(), clock)
     if found is None:
         raise refusal(problem, attempts, hint=False)
-    return without_rival(problem, found, clock)
+    return without_rival(found, clock)
 
 
 def _search(problem, clock):
@@ -177,18 +177,16 @@ def _follow(problem, seeds, attempts, seen, clock):
     for seed in seeds:
         if best is not None and (
             seed.support < _RIVAL_SUPPORT * best_support
-            or is_explained(
-                problem, best, *seed.rows((seed.hypotheses.source, seed.hypotheses.reference))
-            )
+            or is_explained(best, *seed.rows((seed.hypotheses.source, seed.hypotheses.reference)))
         ):
             continue
         for first in seed.pairs_to_try():
-            found, attempts, seen = _try_pairs(problem, seed, first, attempts, seen, clock)
+            found, attempts, seen = _try_pairs(seed, first, attempts, seen, clock)
             if found is None:
                 if attempts.n_partial >= _MOST_PARTIAL and best is None:
                     raise refusal(problem, attempts, hint=False)
                 continue
-            error = header_error(problem, found)
+            error = header_error(found)
             if error is not None:
                 beyond = beyond or error
             elif best is None:
@@ -197,21 +195,21 @@ def _follow(problem, seeds, attempts, seen, clock):
                 best = prefer(best, found)
             break
     if best is not None:
-        return without_rival(problem, best, clock), attempts, seen
+        return without_rival(best, clock), attempts, seen
     if beyond is not None:
         raise beyond
     return None, attempts, seen
 
 
-def _try_pairs(problem, seed, first, attempts, seen, clock):
+def _try_pairs(seed, first, attempts, seen, clock):
     """Grow first pairs of a seed to the frame and judge them, unless that has been done."""
-    pairs, attempts = carry_to_frame(problem, seed, first, attempts, clock)
+    pairs, attempts = carry_to_frame(seed, first, attempts, clock)
     if pairs is None:
         return None, attempts, seen
-    key = seed.turn.tobytes(), pairs[0].tobytes(), pairs[1].tobytes()
+    key = seed.problem.turn.tobytes(), pairs[0].tobytes(), pairs[1].tobytes()
     if key in seen:
         return None, attempts, seen
-    found, attempts = judge_pairs(problem, seed.turn, pairs, attempts, clock)
+    found, attempts = judge_pairs(seed.problem, pairs, attempts, clock)
     return found, attempts, seen | {key}
 
 

@@ -41,8 +41,6 @@ _COUNTED = 60_000
 # which 5.2 sigma (1e-6) are enough.  The count is an upper limit, as if each choice led to another
 # match: of 1500 random fields, including clusters and rows, none reached more than 0 sigma.
 _SEARCH_SHARE = 0.58
-# Number of orientations of the axes that a blind search tries.
-_ORIENTATIONS = 8
 # Maximum leverage in leave-one-out residuals, for pairs that determine the mapping, and minimum
 # fraction of the radius, below which positions are not independent.
 _MOST_LEVERAGE = 0.99
@@ -178,7 +176,18 @@ def _log_poisson_tail(count, expected):
 
 
 def judge_few(
-    points, mapped, radius, leverage, stars, terms, pairs, shape, *, reaches, brightness=None
+    points,
+    mapped,
+    radius,
+    leverage,
+    stars,
+    terms,
+    pairs,
+    shape,
+    *,
+    reaches,
+    orientations=1,
+    brightness=None,
 ):
     r"""Return the significance of a short list against all mappings that could be found.
 
@@ -205,6 +214,8 @@ def judge_few(
     reaches : (float, float, float)
         Largest displacements in the search, px: of a source, of a source relative to another one,
         and of a source without the linear part.
+    orientations : int, optional
+        Number of orientations of the frame that are searched.
     brightness : (ndarray, ndarray), optional
         Brightness of the sources and of the reference stars, in any units that rise with it.
 
@@ -237,7 +248,7 @@ def judge_few(
     if brightness is not None:
         log_chance += log_chance_of_order(brightness[0][i], brightness[1][j])
         log_chance += np.log1p(-log_chance)
-    log_chance += _log_choices(points, mapped, stars, terms, pairs, reaches)
+    log_chance += _log_choices(points, mapped, stars, terms, pairs, reaches, orientations)
     return float(np.sqrt(max(0.0, -2 * log_chance)))
 
 
@@ -262,7 +273,7 @@ def _log_chance_of_places(points, mapped, radius, leverage, stars, terms, pairs,
     return float(log_chance)
 
 
-def _log_choices(points, mapped, stars, terms, pairs, reaches):
+def _log_choices(points, mapped, stars, terms, pairs, reaches, orientations):
     """Logarithm of the number of mappings that the pairs were chosen from."""
     i, j = pairs
     n, n_sources = len(i), len(points)
@@ -277,7 +288,7 @@ def _log_choices(points, mapped, stars, terms, pairs, reaches):
         max(reach, float(np.hypot(*offset.T).max()))
         for reach, offset in zip(reaches, (moved, against, bent), strict=True)
     ]
-    choices = np.log(n * len(_WIDEST) * _ORIENTATIONS)
+    choices = np.log(n * len(_WIDEST) * orientations)
     choices += gammaln(n_sources + 1) - gammaln(terms + 1) - gammaln(n_sources - terms + 1)
     for size, times in zip(sizes, (1, 2, terms - 3), strict=True):
         within = stars.tree.query_ball_point(mapped, size, return_length=True) - is_paired

@@ -13,8 +13,9 @@ from wpdc_gwcs.matching._features import (
     neighbor_pattern,
     select_coherent,
 )
+from wpdc_gwcs.matching._orientations import orientations
 from wpdc_gwcs.matching._pairs import find_nearest
-from wpdc_gwcs.matching._problem import MIN_STARS, Stars
+from wpdc_gwcs.matching._problem import MIN_STARS, Problem, Stars
 
 __all__ = [
     "Seed",
@@ -48,8 +49,8 @@ _AGREEING_SHARE = 0.2
 class Seed:
     """A group of consistent hypotheses, and the lists that it refers to."""
 
+    problem: Problem
     support: float
-    turn: np.ndarray
     sources: Stars
     reference: Stars
     source_rows: np.ndarray
@@ -71,29 +72,31 @@ def find_seeds(problem):
 
     Bright stars are tried first, then more of them, then all, each with more and more anchors.
     """
-    turns = _orientations() if problem.options.blind else [np.eye(2)]
+    problems = [problem]
+    if problem.options.blind:
+        problems = [problem.turned(turn) for turn in orientations()]
     for rows_s, rows_r in bright_subsets(problem):
-        reference = problem.stars
-        if len(rows_r) < len(reference.points):
-            reference = Stars.build(reference.points[rows_r])
+        sources = Stars.build(problem.sources[rows_s])
         rank = None if problem.flux is None else -problem.flux[rows_s]
         for n_anchors, n_neighbors in _TRIES:
             seeds = []
-            for turn in turns:
-                sources = Stars.build(problem.turned(turn)[rows_s])
-                n_near, _ = count_neighbors(problem, sources, reference, N_NEIGHBORS)
+            for turned in problems:
+                reference = turned.stars
+                if len(rows_r) < len(reference.points):
+                    reference = Stars.build(reference.points[rows_r])
+                n_near, _ = count_neighbors(turned, sources, reference, N_NEIGHBORS)
                 hypotheses, groups = find_groups(
-                    problem,
+                    turned,
                     sources,
                     reference,
                     rank,
                     n_anchors,
                     n_neighbors,
-                    _BUDGET // len(turns),
+                    _BUDGET // len(problems),
                 )
                 lists = sources, reference, rows_s, rows_r
                 seeds += [
-                    Seed(support, turn, *lists, hypotheses.take(rows), n_near)
+                    Seed(turned, support, *lists, hypotheses.take(rows), n_near)
                     for support, rows in groups
                 ]
             seeds.sort(key=lambda seed: -seed.support)
@@ -151,7 +154,7 @@ def find_groups(problem, sources, reference, rank, n_anchors, n_neighbors, budge
         n_source=n_source,
         n_reference=n_reference,
         max_log_scale=limits.max_scale + limits.gradient,
-        max_rotation=np.deg2rad(limits.max_rotation) + limits.gradient,
+        max_rotation=np.deg2rad(limits.max_turn) + limits.gradient,
         budget=budget,
     )
     area = np.pi * (limits.half_diagonal + limits.reach(limits.half_diagonal)) ** 2
@@ -186,14 +189,6 @@ def _choose_anchors(problem, sources, rank, n_anchors):
     # distortion is usually weakest there.
     chosen = order[np.argsort(place, kind="stable")[:n_anchors]]
     return chosen[np.argsort(np.hypot(*(sources[chosen] - problem.frame.center).T))]
-
-
-def _orientations():
-    """List the eight orientations of the axes of a rectangle, the identity first."""
-    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
-    flip = np.diag([-1.0, 1.0])
-    turns = [np.linalg.matrix_power(quarter, n) for n in range(4)]
-    return turns + [turn @ flip for turn in turns]
 
 
 def first_pairs(sources, reference, hypotheses, n_neighbors):

@@ -140,6 +140,13 @@ class SmoothMap:
         coefficients[:, 0] += dx, dy
         return SmoothMap(self.order, coefficients, self.center, self.scale)
 
+    def turned_back(self, turn):
+        """Return the same mapping to a plane that has been turned about the center by `turn`."""
+        coefficients = turn.T @ self.coefficients
+        # The columns of u and v follow that of the shift.
+        coefficients[:, 1:3] += self.scale * (turn.T - np.eye(2))
+        return SmoothMap(self.order, coefficients, self.center, self.scale)
+
     def __call__(self, x, y):
         """Map positions.
 

@@ -14,12 +14,14 @@ class MatchOptions:
     Parameters
     ----------
     blind : bool
-        Also search mirrored frames, frames rotated by 90, 180 and 270 degrees, scales off by up to
-        6 % and pointings off by up to 0.3 of the frame.
+        Also search mirrored frames, all rotations, scales off by up to 6 % and pointings off by up
+        to 0.3 of the frame.
     max_shift : float, optional
         Largest error of the pointing, px; default 0.15 of the longer side, at least 450 px.
     max_rotation : float
-        Largest error of the rotation at the center of the frame, deg.
+        Largest error of the rotation at the center of the frame, deg.  A blind search accepts any
+        rotation, unless the stars are so few that mappings are counted: then it is the largest
+        difference from a multiple of 45 deg.
     max_scale : float
         Largest relative error of the scale at the center of the frame.
     max_distortion : float, optional

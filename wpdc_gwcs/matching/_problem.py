@@ -1,6 +1,7 @@
 """The problem of a match: two clean lists, and how wrong the start may be."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -8,6 +9,7 @@ from scipy.spatial import cKDTree
 from wpdc_gwcs.exceptions import MatchError
 from wpdc_gwcs.matching._mapping import SmoothMap
 from wpdc_gwcs.matching._options import MatchOptions
+from wpdc_gwcs.matching._orientations import HALF_STEP
 from wpdc_gwcs.matching._pairs import find_nearest
 
 __all__ = [
@@ -55,6 +57,7 @@ class Limits:
 
     max_shift: float
     max_rotation: float
+    max_turn: float  # of patterns, in deg: larger in a blind search, which tries steps of rotation
     max_scale: float
     max_distortion: float
     half_diagonal: float
@@ -79,7 +82,11 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Two lists in one plane and the rules of their match."""
+    """Two lists in one plane and the rules of their match.
+
+    In a blind search, there is one problem for each `turn` of the reference stars about the center
+    of the frame.  The sources stay on the frame, whose shape they fill.
+    """
 
     sources: np.ndarray
     limit: np.ndarray  # largest meaningful radius at each source
@@ -94,10 +101,17 @@ class Problem:
     frame: SmoothMap  # the identity on the frame: center and scale of all mappings
     limits: Limits
     options: MatchOptions
+    turn: np.ndarray = field(default_factory=partial(np.eye, 2))
 
     def turned(self, turn):
-        """Rotate all sources about the center of the frame."""
-        return (self.sources - self.frame.center) @ turn.T + self.frame.center
+        """Turn the reference stars about the center of the frame: an orthogonal matrix."""
+        points = (self.stars.points - self.frame.center) @ turn.T + self.frame.center
+        stars = Stars(points, cKDTree(points), self.stars.limit)
+        return replace(self, stars=stars, turn=turn @ self.turn)
+
+    def turned_back(self, points):
+        """Return places among the turned reference stars as places in the original plane."""
+        return (points - self.frame.center) @ self.turn + self.frame.center
 
 
 def prepare_problem(
@@ -162,7 +176,10 @@ def _limits_of(options, shape):
     if max_distortion is None:
         max_distortion = min(_MAX_DISTORTION, _MAX_DISTORTION_SHARE * longer)
     half_diagonal = 0.5 * np.hypot(*shape)
-    return Limits(max_shift, options.max_rotation, max_scale, max_distortion, half_diagonal)
+    max_turn = max(options.max_rotation, HALF_STEP if options.blind else 0.0)
+    return Limits(
+        max_shift, options.max_rotation, max_turn, max_scale, max_distortion, half_diagonal
+    )
 
 
 def _prepare(name_x, name_y, x, y, brightness, name_brightness):

@@ -18,9 +18,10 @@ from wpdc_gwcs.matching._growth import (
     predict,
     sample_rows,
 )
-from wpdc_gwcs.matching._mapping import SmoothMap, fit_smooth_map, turn_and_scale
+from wpdc_gwcs.matching._mapping import SmoothMap, turn_and_scale
+from wpdc_gwcs.matching._orientations import N_ORIENTATIONS
 from wpdc_gwcs.matching._pairs import find_edges, one_to_one
-from wpdc_gwcs.matching._problem import BLIND_SCALE, MIN_STARS
+from wpdc_gwcs.matching._problem import BLIND_SCALE, MIN_STARS, Problem
 from wpdc_gwcs.matching._rivals import find_rival_offset
 
 __all__ = [
@@ -50,17 +51,17 @@ _EXPLAINED, _MOST = 3.0, 0.5
 # A header with such a wrong area of a pixel cannot be correct up to a rotation: it is a mirror.
 _MOST_STRETCH = 2.0
 
-_HINT = (
-    "if the header may be mirrored, turned by 90 degrees, off in scale by up to 5 % or off in "
-    "pointing by up to a quarter of the frame, widen the search with blind=True (--blind)"
-)
+_HINT = "blind=True (--blind) also searches mirrored and turned frames, other scales and pointings"
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Result of a search: the mapping, the pairs and their evidence."""
+    """Result of a search: the mapping, the pairs and their evidence.
 
-    turn: np.ndarray
+    The problem has the reference stars as they were turned; the mapping leads to these.
+    """
+
+    problem: Problem
     turned_mapping: SmoothMap
     mapped: np.ndarray
     radius: np.ndarray
@@ -71,13 +72,13 @@ class Match:
 
     @property
     def mapping(self):
-        """The mapping of the frame in its original orientation."""
-        return _turn_mapping(self.turned_mapping, self.turn)
+        """The mapping to the reference stars in their original orientation."""
+        return self.turned_mapping.turned_back(self.problem.turn)
 
     @property
     def parity(self):
         """-1 if the frame is mirrored, else 1."""
-        return int(np.sign(np.linalg.det(self.turn)))
+        return int(np.sign(np.linalg.det(self.problem.turn)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +97,9 @@ class Attempts:
         return Attempts(best, self.n_partial + bool(partial))
 
 
-def carry_to_frame(problem, seed, pairs, attempts, clock):
+def carry_to_frame(seed, pairs, attempts, clock):
     """Grow first pairs of a seed's lists; rows of the pairs in the whole lists, or `None`."""
+    problem = seed.problem
     sources, reference = seed.sources, seed.reference
     part = sample_rows(len(sources.points), pairs[0])
     pairs = np.searchsorted(part, pairs[0]), pairs[1]
@@ -116,9 +118,9 @@ def carry_to_frame(problem, seed, pairs, attempts, clock):
     return seed.rows((part[pairs[0]], pairs[1])), attempts
 
 
-def judge_pairs(problem, turn, pairs, attempts, clock):
+def judge_pairs(problem, pairs, attempts, clock):
     """Grow over all stars, pair with the final radius, judge: a `Match`, or `None`."""
-    points = problem.turned(turn)
+    points = problem.sources
     fit = fit_pairs(problem, points[pairs[0]], problem.stars.points[pairs[1]])
     if fit is None:
         return None, attempts
@@ -152,12 +154,15 @@ def judge_pairs(problem, turn, pairs, attempts, clock):
         # Correct except in a part of the frame: other starts rarely help.
         partial = evidence.is_significant(options.min_significance)
         return None, attempts.after(evidence, partial=partial)
-    return Match(turn, fit.mapping, mapped, radius, pairs, n_ambiguous, scatter, evidence), attempts
+    return Match(
+        problem, fit.mapping, mapped, radius, pairs, n_ambiguous, scatter, evidence
+    ), attempts
 
 
 def _judge_few(problem, points, mapped, radius, leverage, terms, pairs):
     limits = problem.limits
     reach = limits.reach(limits.half_diagonal)
+    blind = problem.options.blind
     known = problem.flux is not None and problem.brightness is not None
     return judge_few(
         points,
@@ -169,13 +174,14 @@ def _judge_few(problem, points, mapped, radius, leverage, terms, pairs):
         pairs,
         problem.shape,
         reaches=(reach, reach - limits.max_shift, limits.max_distortion),
+        orientations=N_ORIENTATIONS if blind else 1,
         brightness=(problem.flux, problem.brightness) if known else None,
     )
 
 
-def is_explained(problem, match, i, j):
+def is_explained(match, i, j):
     """Return whether most of some candidate pairs agree with a match to within a few radii."""
-    gap = np.hypot(*(match.mapped[i] - problem.stars.points[j]).T)
+    gap = np.hypot(*(match.mapped[i] - match.problem.stars.points[j]).T)
     return np.mean(gap <= _EXPLAINED * match.radius[i]) > _MOST
 
 
@@ -188,7 +194,8 @@ def prefer(one, other):
         return better
     if min(strengths) < _EQUAL * max(strengths):
         return better
-    gap = np.median(np.hypot(*(one.mapped - other.mapped).T))
+    places = (m.problem.turned_back(m.mapped) for m in (one, other))
+    gap = np.median(np.hypot(*np.subtract(*places).T))
     raise MatchError(
         f"the match is ambiguous: {counted(one.evidence.n_pairs, 'pair')} "
         f"({one.evidence.significance:.1f} sigma) and {counted(other.evidence.n_pairs, 'pair')} "
@@ -197,8 +204,9 @@ def prefer(one, other):
     )
 
 
-def without_rival(problem, match, clock):
+def without_rival(match, clock):
     """Make sure that no shift matches the same sources to other stars equally well."""
+    problem = match.problem
     for _ in range(_MOST_RIVALS):
         i, j = match.pairs
         offset = find_rival_offset(
@@ -215,8 +223,8 @@ def without_rival(problem, match, clock):
         pairs, _ = pair(match.mapped + offset, match.radius, problem.limit, problem.stars)
         if len(pairs[0]) < MIN_STARS:
             return match
-        rival, _ = judge_pairs(problem, match.turn, pairs, Attempts(), clock)
-        if rival is None or header_error(problem, rival) is not None:
+        rival, _ = judge_pairs(problem, pairs, Attempts(), clock)
+        if rival is None or header_error(rival) is not None:
             return match
         better = prefer(match, rival)
         if better is match:
@@ -228,31 +236,31 @@ def without_rival(problem, match, clock):
     )
 
 
-def header_error(problem, match):
+def header_error(match):
     """Build the error for a match that is farther from the header than allowed, or None.
 
     Rotation and scale are those at the center of the frame, or those of the pairs as a whole
     where these are closer to the header: with few pairs in a part of the frame only, the
     mapping means nothing at the center.
     """
+    problem, limits = match.problem, match.problem.limits
     shift, at_center = match.turned_mapping.linear_part()
     rows = match.pairs[0]
-    place, mapped = problem.turned(match.turn)[rows], match.mapped[rows]
-    of_pairs = np.linalg.lstsq(place - place.mean(axis=0), mapped - mapped.mean(axis=0), None)[0].T
+    of_pairs = _fit_matrix(problem.sources[rows], match.mapped[rows])
     area = float(np.linalg.det(of_pairs))
     if not 1 / _MOST_STRETCH < area < _MOST_STRETCH:
         # On a narrow frame, a mirrored mapping may be within the other limits.
         return MatchError(
             f"the starting WCS is mirrored or stretched: the pairs change the area of the "
-            f"frame by a factor of {area:.3g}{_hint(problem)}"
+            f"frame by a factor of {area:.3g}{_hint(problem)}",
+            found=_describe(match),
         )
     turned, scaled = zip(
         *(turn_and_scale(matrix, problem.shape) for matrix in (at_center, of_pairs)), strict=True
     )
-    limits = problem.limits
     for what, value, most, unit in (
         ("pointing", float(np.hypot(*shift)), limits.max_shift, "px"),
-        ("rotation", min(np.abs(turned)), limits.max_rotation, "deg"),
+        ("rotation", min(np.abs(turned)), _most_rotation(match), "deg"),
         ("scale", 100 * min(np.abs(np.subtract(scaled, 1))), 100 * limits.max_scale, "%"),
     ):
         if value > most:
@@ -262,13 +270,40 @@ def header_error(problem, match):
             return MatchError(
                 f"the {what} of the starting WCS is off by {value:.4g} {unit}, "
                 f"at most {most:.4g} {unit} is allowed{hint}",
-                found={
-                    "shift": tuple(map(float, shift)),
-                    "rotation": float(turned[1]),
-                    "scale": float(scaled[1]),
-                },
+                found=_describe(match),
             )
     return None
+
+
+def _most_rotation(match):
+    """Largest rotation from the orientation that was tried, deg."""
+    options = match.problem.options
+    if options.blind and match.evidence.significance >= options.min_significance:
+        # Any rotation.  With few stars, not all mappings in between have been counted.
+        return 180.0
+    return match.problem.limits.max_rotation
+
+
+def _fit_matrix(points, mapped):
+    """Fit the matrix of an affine mapping by least squares."""
+    centered = points - points.mean(axis=0), mapped - mapped.mean(axis=0)
+    return np.linalg.lstsq(*centered, None)[0].T
+
+
+def _describe(match):
+    """Describe by how much the header is off, for an error."""
+    problem, rows = match.problem, match.pairs[0]
+    matrix = _fit_matrix(problem.sources[rows], problem.turned_back(match.mapped[rows]))
+    if match.parity < 0:
+        matrix = matrix @ np.diag([-1, 1])
+    rotation, scale = turn_and_scale(matrix, problem.shape)
+    return {
+        "n_pairs": len(rows),
+        "shift": tuple(map(float, match.mapping.linear_part()[0])),
+        "rotation": rotation,
+        "scale": scale,
+        "parity": match.parity,
+    }
 
 
 def _hint(problem):
@@ -291,25 +326,3 @@ def refusal(problem, attempts, *, hint=True):
         f"{counted(n_reference, 'reference star')} in reach): {reason}"
         + (_hint(problem) if hint else "")
     )
-
-
-def _turn_mapping(mapping, turn):
-    """Rewrite the mapping of a turned frame as one of the frame itself, exactly."""
-    if (turn == np.eye(2)).all():
-        return mapping
-    n = mapping.order + 2
-    u, v = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
-    x, y = (
-        mapping.center[0] + mapping.scale * u.ravel(),
-        mapping.center[1] + mapping.scale * v.ravel(),
-    )
-    turned = (np.column_stack([x, y]) - mapping.center) @ turn.T + mapping.center
-    fit = fit_smooth_map(
-        x,
-        y,
-        *mapping(*turned.T),
-        center=mapping.center,
-        scale=mapping.scale,
-        max_order=mapping.order,
-    )
-    return fit.mapping

@@ -1,5 +1,6 @@
 """The PV (TPV) polynomial in intermediate world coordinates and its exact inverse."""
 
+from functools import partial
 from operator import attrgetter
 
 import numpy as np
@@ -192,6 +193,23 @@ class PVPolynomial(FittableModel):
         """
         coefficients = np.array([np.ravel(c)[0] for c in coefficients], dtype=float)
         return evaluate_blocks(self._plane_map(coefficients.reshape(2, -1)).evaluate, xi, eta)
+
+    def as_function(self):
+        """Return the polynomial as it is now as a plain function, without the overhead of a model.
+
+        Returns
+        -------
+        function : callable
+            ``function(xi, eta)`` returns both outputs.
+
+        Examples
+        --------
+        >>> from wpdc_gwcs.models import PVPolynomial
+        >>> xi, eta = PVPolynomial(2).as_function()([2.0], [3.0])
+        >>> float(xi[0]), float(eta[0])
+        (2.0, 3.0)
+        """
+        return partial(evaluate_blocks, self._plane_map(self.coefficients).evaluate)
 
     def design_matrix(self, xi, eta):
         """Return the derivatives of both outputs by their coefficients, as columns in FITS order.

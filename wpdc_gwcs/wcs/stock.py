@@ -1,8 +1,9 @@
 """Conversion of a WCS to stock astropy models."""
 
 import pickle
-from dataclasses import dataclass, field
-from functools import lru_cache
+from collections import OrderedDict
+from hashlib import sha256
+from threading import Lock
 
 import numpy as np
 from astropy.modeling.models import (
@@ -91,15 +92,9 @@ def to_stock_wcs(wcs):
 # Detectors whose first step is kept: all frames of a detector share it, its inverse takes a while,
 # and the frames of a camera come exposure by exposure.
 _KEPT = 64
-
-
-@dataclass(frozen=True)
-class _FirstStep:
-    """First step of the WCS of a detector, equal to others of the same content."""
-
-    content: bytes
-    distortion: DistortionCorrection = field(compare=False)
-    image_shape: tuple = field(compare=False)
+# Pickled first steps by a digest of their content, the last used last.
+_kept = OrderedDict()
+_lock = Lock()
 
 
 def _stock_first_step(distortion, image_shape):
@@ -112,14 +107,23 @@ def _stock_first_step(distortion, image_shape):
             image_shape,
         )
     )
+    # No more than that is kept: the distortion of a frame has tables of a megabyte.
+    key = sha256(content).digest()
+    with _lock:
+        model = _kept.pop(key, None)
+    if model is None:
+        model = _pickled_model(distortion, image_shape)
+    with _lock:
+        _kept[key] = model
+        while len(_kept) > _KEPT:
+            _kept.popitem(last=False)
     # Unpickling takes half the time of a copy.
-    return pickle.loads(_pickled_model(_FirstStep(content, distortion, image_shape)))
+    return pickle.loads(model)
 
 
-@lru_cache(_KEPT)
-def _pickled_model(step):
-    model = _stock_distortion(step.distortion)
-    inverse = _stock_inverse(step.distortion, step.image_shape)
+def _pickled_model(distortion, image_shape):
+    model = _stock_distortion(distortion)
+    inverse = _stock_inverse(distortion, image_shape)
     if inverse is not None:
         model.inverse = inverse
     model.name = "distortion_correction"
