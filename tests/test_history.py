@@ -81,6 +81,17 @@ def test_few_stars_are_not_tested():
         track_drift(solution_of("d"), [])
 
 
+@pytest.mark.parametrize(("epochs", "width"), [([2020.0], 2 / 365.25), ([2020.0, 2020.1], 0.2)])
+def test_a_single_period_is_drawn_on_an_axis_of_its_length(epochs, width):
+    rng = np.random.default_rng(5)
+    tables = [matches_of(rng, n=50) for _ in epochs]
+    figure = plotting.plot_drift_history(track_drift(solution_of("d"), [(epochs, tables)]))
+    for axes in figure.axes:
+        low, high = axes.get_xlim()
+        assert low < np.mean(epochs) < high
+        assert high - low == pytest.approx(width)
+
+
 @pytest.mark.parametrize(
     ("days", "expected"),
     [(1.0, [[1], [2, 0], [3]]), (10.0, [[1, 2, 0, 3]]), (2.0, [[1, 2, 0], [3]])],

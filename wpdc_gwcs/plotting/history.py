@@ -7,6 +7,8 @@ from wpdc_gwcs.plotting._style import BLACK, BLUE, DIVERGING, GREY, ORANGE, new_
 
 __all__ = ["plot_cell_history", "plot_drift_history"]
 
+# A day, in years.
+_ONE_NIGHT = 1 / 365.25
 # Labels of cells along each side of the detector.
 _MOST_LABELS = 16
 
@@ -57,6 +59,11 @@ def plot_drift_history(history):
     change.set_ylabel("change [px rms]")
     change.set_ylim(0, 1.2 * table["amplitude"].value.max() or 0.1)
     change.set_xlabel(label)
+    if len(table) == 1:
+        # Without this, a single epoch would be drawn on an axis of two centuries.
+        length = float(table["last_epoch"][0] - table["first_epoch"][0])
+        margin = max(length, _ONE_NIGHT) if label.startswith("epoch") else 1.0
+        change.set_xlim(time[0] - margin, time[0] + margin)
     untested = ~np.isfinite(np.asarray(table["p_value"], float))
     for mask, color, name in ((drifted, "#CC0000", "alarm"), (untested, GREY, "too few stars")):
         for axes in (means, scatter, change):
