@@ -154,9 +154,8 @@ def judge_pairs(problem, pairs, attempts, clock):
         # Correct except in a part of the frame: other starts rarely help.
         partial = evidence.is_significant(options.min_significance)
         return None, attempts.after(evidence, partial=partial)
-    return Match(
-        problem, fit.mapping, mapped, radius, pairs, n_ambiguous, scatter, evidence
-    ), attempts
+    match = Match(problem, fit.mapping, mapped, radius, pairs, n_ambiguous, scatter, evidence)
+    return match, attempts
 
 
 def _judge_few(problem, points, mapped, radius, leverage, terms, pairs):
@@ -253,7 +252,8 @@ def header_error(match):
         return MatchError(
             f"the starting WCS is mirrored or stretched: the pairs change the area of the "
             f"frame by a factor of {area:.3g}{_hint(problem)}",
-            found=_describe(match),
+            # A mirrored mapping has no rotation and no scale.
+            found=_describe(match) if area > 0 else None,
         )
     turned, scaled = zip(
         *(turn_and_scale(matrix, problem.shape) for matrix in (at_center, of_pairs)), strict=True
