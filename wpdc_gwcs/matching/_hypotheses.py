@@ -77,13 +77,13 @@ def find_seeds(problem):
         problems = [problem.turned(turn) for turn in orientations()]
     for rows_s, rows_r in bright_subsets(problem):
         sources = Stars.build(problem.sources[rows_s])
+        references = [turned.stars for turned in problems]
+        if len(rows_r) < len(problem.stars.points):
+            references = [Stars.build(stars.points[rows_r]) for stars in references]
         rank = None if problem.flux is None else -problem.flux[rows_s]
         for n_anchors, n_neighbors in _TRIES:
             seeds = []
-            for turned in problems:
-                reference = turned.stars
-                if len(rows_r) < len(reference.points):
-                    reference = Stars.build(reference.points[rows_r])
+            for turned, reference in zip(problems, references, strict=True):
                 n_near, _ = count_neighbors(turned, sources, reference, N_NEIGHBORS)
                 hypotheses, groups = find_groups(
                     turned,
